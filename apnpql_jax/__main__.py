@@ -1,0 +1,10 @@
+"""``python -m apnpql_jax`` is the command ``apnpql``."""
+
+from __future__ import annotations
+
+import sys
+
+from apnpql_jax.cli import main
+
+if __name__ == "__main__":
+  sys.exit(main())

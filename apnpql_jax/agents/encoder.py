@@ -1,0 +1,105 @@
+"""Feature extractor: pixels and states to the shared features phi (Sec. IV-B)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import functools
+
+from flax import linen as nn
+import jax.numpy as jnp
+
+from apnpql_jax.types import ARM_DOF, Array, Observation
+
+PATCH = 4
+"""Side of the pixel patches that the first convolution sees."""
+
+_STEP_SCALE = 7.0
+"""Brings a joint's change per control period (0.15 rad at most) to order one."""
+
+
+class PixelEncoder(nn.Module):
+  """Two convolution layers with relu for one camera, flattened.
+
+  The first layer has kernel = stride = 4 and is written as one matrix product over
+  pixel patches, which XLA:CPU runs several times faster than an overlapping
+  convolution. The map is flattened, not pooled: where a thing is must survive.
+  """
+
+  channels: Sequence[int]
+  overlap: bool
+
+  @nn.compact
+  def __call__(self, image: Array) -> Array:
+    """u8[*b, H, W, 3] -> f32[*b, n]."""
+    first, second = self.channels
+    # Rearranged while still bytes: a quarter of the traffic.
+    patches = space_to_depth(image, PATCH).astype(jnp.float32) / 255.0
+    x = nn.relu(nn.Dense(first, name="patches")(patches))
+    if self.overlap:
+      x = nn.Conv(second, kernel_size=(3, 3), strides=(2, 2), name="conv")(x)
+    else:
+      x = nn.Dense(second, name="conv")(space_to_depth(x, 2))
+    return nn.relu(x).reshape(*image.shape[:-3], -1)
+
+
+class Encoder(nn.Module):
+  """Feature extractor f^fe: observation -> phi (paper Sec. IV-B).
+
+  Each modality present has its own projection, and the projections are summed, so
+  that thousands of pixel features do not drown a few dozen of the robot. The layer
+  norm gives phi a fixed scale: the heads that read phi without training it (prior,
+  alpha) then follow the encoder instead of chasing its growing activations.
+  """
+
+  feature_dim: int
+  channels: Sequence[int]
+  overlap: bool
+
+  @nn.compact
+  def __call__(self, observation: Observation) -> Array:
+    """Observation with batch *b -> f32[*b, feature_dim]."""
+    body = functools.partial(nn.Dense, self.feature_dim)
+    state = [robot_inputs(observation.robot)]
+    if observation.objects is not None:
+      state.append(observation.objects)
+    state = nn.relu(body(name="state")(jnp.concatenate(state, axis=-1)))
+    x = body(name="from_state")(state)
+    for name in ("global_image", "wrist_image"):
+      image = getattr(observation, name)
+      if image is not None:
+        pixels = PixelEncoder(self.channels, self.overlap, name=name)(image)
+        x = x + body(name=f"from_{name}", use_bias=False)(pixels)
+    return nn.relu(nn.LayerNorm(name="norm")(x))
+
+
+def robot_inputs(robot: Array) -> Array:
+  """Network inputs of order one from the stacked robot state.
+
+  Args:
+    robot: f32[*b, 3 * 7], the last three (6 joint angles, gripper angle), newest
+      last, in rad.
+
+  Returns:
+    f32[*b, 33]: newest state, sine and cosine of its joints, the last two changes.
+  """
+  stack = robot.reshape(*robot.shape[:-1], 3, ARM_DOF + 1)
+  newest = stack[..., -1, :]
+  changes = _STEP_SCALE * (stack[..., 1:, :] - stack[..., :-1, :])
+  joints = newest[..., :ARM_DOF]
+  return jnp.concatenate(
+    [newest, jnp.sin(joints), jnp.cos(joints), changes.reshape(*robot.shape[:-1], -1)],
+    axis=-1,
+  )
+
+
+def space_to_depth(image: Array, size: int) -> Array:
+  """Moves size x size patches into channels, padding bottom and right with zeros.
+
+  [*b, H, W, C] -> [*b, ceil(H / size), ceil(W / size), size * size * C].
+  """
+  *batch, height, width, channels = image.shape
+  pad = [(0, 0)] * len(batch) + [(0, -height % size), (0, -width % size), (0, 0)]
+  image = jnp.pad(image, pad)
+  rows, columns = image.shape[-3] // size, image.shape[-2] // size
+  image = image.reshape(*batch, rows, size, columns, size, channels)
+  return jnp.swapaxes(image, -4, -3).reshape(*batch, rows, columns, -1)

@@ -1,0 +1,127 @@
+"""The losses of AP-NPQL, one number per state, without networks or parameters.
+
+``*b`` are any batch axes, S candidate actions come first. What a loss must not
+train is stopped here or in ``Networks``, so that the gradients of a sum of all
+losses fall apart into the groups that the paper's Algorithm 1 names.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from apnpql_jax.dists import boltzmann, categorical, gmm
+from apnpql_jax.types import Array
+
+
+def weighted_mean(losses: Array, weight: Array) -> Array:
+  """Mean of f32[*b] losses under f32[*b] weights >= 0; zero if all weights are."""
+  return jnp.sum(weight * losses) / jnp.maximum(jnp.sum(weight), 1e-6)
+
+
+def ap_loss(predicted: Array, label: Array, *, delta: float) -> Array:
+  """Behaviour cloning of the action primitives, L^ap (paper Eq. 9).
+
+  Huber loss: quadratic below ``delta`` (rad/s), where the arm closes in on its
+  target, and linear above, where labels of distant targets saturate.
+
+  Args:
+    predicted: f32[*b, 3, 6], rad/s.
+    label: f32[*b, 3, 6], rad/s.
+    delta: width of the quadratic part, rad/s.
+
+  Returns:
+    f32[*b], mean over primitives and joints, in units of ``delta``.
+  """
+  huber = optax.losses.huber_loss(predicted, label, delta=delta) / delta
+  return jnp.mean(huber, axis=(-2, -1))
+
+
+def value_target(
+  logits_t: Array, weights_t: Array, reward_t: Array, discount_t: Array, atoms: Array
+) -> Array:
+  """Distributional N-step target E_{a ~ q}[z-bar] (paper Eq. 7, right side).
+
+  The expectation over candidates comes before the projection, which is linear.
+
+  Args:
+    logits_t: f32[S, *b, n] target network's Z(s_t, a_i).
+    weights_t: f32[S, *b] importance weights of the candidates.
+    reward_t: f32[*b] discounted sum of N rewards.
+    discount_t: f32[*b] gamma^N, zero where the episode terminated.
+    atoms: f32[n] support.
+
+  Returns:
+    f32[*b, n] probabilities, without gradient.
+  """
+  probs_t = jnp.sum(weights_t[..., None] * jax.nn.softmax(logits_t), axis=0)
+  target = categorical.project(probs_t, reward_t, discount_t, atoms)
+  return jax.lax.stop_gradient(target)
+
+
+def q_loss(logits_tm1: Array, target: Array) -> Array:
+  """Cross-entropy of Z(s_tm1, a_tm1) to the target, L^Q (paper Eq. 7).
+
+  Args:
+    logits_tm1: f32[*b, n].
+    target: f32[*b, n] probabilities.
+
+  Returns:
+    f32[*b].
+  """
+  return categorical.cross_entropy(target, logits_tm1)
+
+
+def alpha_loss(q_tm1: Array, alpha_tm1: Array, *, epsilon: float) -> Array:
+  """Dual of the KL limit, to be minimised over alpha(s) (paper Eq. 6).
+
+  Args:
+    q_tm1: f32[S, *b] values of candidates drawn from the prior; not trained.
+    alpha_tm1: f32[*b].
+    epsilon: limit of KL(q || b) in nats.
+
+  Returns:
+    f32[*b].
+  """
+  q_tm1 = jax.lax.stop_gradient(q_tm1)
+  return boltzmann.dual(q_tm1, alpha_tm1, epsilon=epsilon)
+
+
+def m_step_loss(
+  prior: gmm.GripperGMM, samples: Array, weights: Array, nu: Array
+) -> Array:
+  """Fits the prior to q and keeps it broad, L^M (paper Eq. 10).
+
+  -sum_i w_i log b(a_i) - nu H(b): the first term is KL(q || b) up to a constant.
+  The paper prints + nu H(b) but introduces the term for exploration, so entropy is
+  rewarded. H is a lower bound, which makes the floor a safe one.
+
+  Args:
+    prior: b_theta(. | s_tm1) with gradients to theta^bp.
+    samples: f32[S, *b, 7] unclipped draws of the prior.
+    weights: f32[S, *b] their importance weights under q.
+    nu: f32[] multiplier >= 0.
+
+  Returns:
+    f32[*b].
+  """
+  samples, weights, nu = jax.lax.stop_gradient((samples, weights, nu))
+  nll = -jnp.sum(weights * gmm.log_prob(prior, samples), axis=0)
+  return nll - nu * gmm.entropy_bound(prior)
+
+
+def nu_loss(nu: Array, entropy: Array, *, epsilon_nu: float) -> Array:
+  """Dual of the entropy floor, nu (H(b) - epsilon_nu) (text below paper Eq. 10).
+
+  Minimised over nu >= 0: nu grows while the entropy is below its floor.
+
+  Args:
+    nu: f32[].
+    entropy: f32[*b] entropy of the prior in nats; not trained.
+    epsilon_nu: the floor in nats.
+
+  Returns:
+    f32[*b].
+  """
+  return nu * (jax.lax.stop_gradient(entropy) - epsilon_nu)

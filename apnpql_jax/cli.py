@@ -1,0 +1,240 @@
+"""The command ``apnpql``: train, evaluate, collect, list. Parses and calls, no more.
+
+JAX, MuJoCo and everything built on them are imported inside the commands, so that
+help and refusals of bad input are instant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Sequence
+import contextlib
+import dataclasses
+import json
+import math
+import os
+from pathlib import Path
+import sys
+from typing import Any
+
+import apnpql_jax
+from apnpql_jax import presets, runs
+from apnpql_jax.config import (
+  BACKENDS,
+  ConfigError,
+  EnvConfig,
+  TrainConfig,
+  check_name,
+  validate,
+)
+from apnpql_jax.options import Collect, Evaluate, List, Train, parse
+
+Json = dict[str, Any]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+  """Runs one command line; returns the exit code.
+
+  0 success, 2 bad input (one line on standard error), 130 stopped by the user.
+  """
+  args = list(sys.argv[1:] if argv is None else argv)
+  try:
+    if not args:
+      raise ConfigError(f"name a command: {', '.join(_COMMANDS)} (see apnpql --help)")
+    if args[0] in ("-h", "--help"):
+      print(_help())
+      return 0
+    if args[0] == "--version":
+      print(apnpql_jax.__version__)
+      return 0
+    check_name("command", args[0], list(_COMMANDS))
+    kind, command, show = _COMMANDS[args[0]]
+    parsed = parse(kind, args[0], args[1:])
+    with _only_json(parsed.json) as write:
+      result = command(parsed, args[1:])
+      write(_to_json(result) if parsed.json else show(result))
+    return 0
+  except ConfigError as error:
+    print("apnpql: " + " ".join(str(error).split()), file=sys.stderr)
+    return 2
+  except KeyboardInterrupt:
+    return 130
+  except BrokenPipeError:  # The reader of our output left, as `head` does.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    return 0
+
+
+def train(args: Train, argv: Sequence[str]) -> Json:
+  """Validates everything, then trains or goes on training; returns its summary."""
+  if args.resume is not None and (args.run is not None or args.overwrite):
+    raise ConfigError("--resume names the run itself; leave out --run and --overwrite")
+  if not args.preset and args.resume is None:
+    names = ", ".join(presets.preset_names())
+    raise ConfigError(f"train needs a preset; choose from {names}")
+  if args.preset:
+    base = presets.load_preset(args.preset)
+  else:
+    base = runs.load_run_config(args.resume or Path())
+  # Parsed a second time, now on top of the settings asked for.
+  args = parse(Train, "train", argv, default=Train(config=base))
+  config = _with_shortcuts(args)
+  run_dir = args.resume or args.run or runs.new_run_dir(args.preset)
+  if args.resume is None:
+    runs.check_free(run_dir, overwrite=args.overwrite)
+  validate(config)
+  if args.resume is not None:
+    runs.check_resumable(args.resume, config)
+  _check_registered(config)
+
+  from apnpql_jax.train import train as run_training
+
+  if args.resume is not None:
+    return run_training(config, run_dir, resume=True)
+  with runs.fresh_run_dir(run_dir) as folder:
+    return run_training(config, folder, resume=False)
+
+
+def evaluate(args: Evaluate, argv: Sequence[str]) -> Json:
+  """Plays held-out episodes with the newest checkpoint of a run."""
+  del argv
+  if not args.run:
+    raise ConfigError("evaluate needs a run folder: apnpql evaluate RUN")
+  _check_episodes(args.episodes, args.seed)
+  if args.backend is not None:
+    check_name("backend", args.backend, BACKENDS)
+  runs.load_run_config(Path(args.run))
+
+  from apnpql_jax.evaluate import evaluate_run
+
+  return evaluate_run(
+    Path(args.run), episodes=args.episodes, seed=args.seed, backend=args.backend
+  )
+
+
+def collect(args: Collect, argv: Sequence[str]) -> Json:
+  """Plays episodes with the scripted expert of a task."""
+  del argv
+  _check_episodes(args.episodes, args.seed)
+  check_name("backend", args.backend, BACKENDS)
+  if not 0.0 <= args.noise < float("inf"):
+    raise ConfigError(f"--noise {args.noise} must be a number of at least 0, in rad/s")
+
+  from apnpql_jax import tasks
+
+  check_name("task", args.task, tasks.task_names())
+  env = EnvConfig(task=args.task)
+  if args.task in presets.preset_names():
+    env = presets.load_preset(args.task).env
+
+  from apnpql_jax.evaluate import evaluate_expert
+
+  # The expert acts on privileged poses: drawing images would only cost time.
+  env = dataclasses.replace(env, task=args.task, backend=args.backend, obs="state")
+  return evaluate_expert(env, episodes=args.episodes, seed=args.seed, noise=args.noise)
+
+
+def list_names(args: List, argv: Sequence[str]) -> Json:
+  """The names that other commands accept."""
+  del args, argv
+  from apnpql_jax import tasks
+  from apnpql_jax.agents import algorithms
+
+  return {
+    "tasks": list(tasks.task_names()),
+    "presets": presets.preset_names(),
+    "algorithms": list(algorithms.ALGORITHMS),
+    "backends": list(BACKENDS),
+  }
+
+
+def _check_registered(config: TrainConfig) -> None:
+  """Checks what needs the simulator, the learner or the device to be known."""
+  from apnpql_jax import memory, tasks
+  from apnpql_jax.agents import algorithms
+
+  validate(
+    config,
+    tasks=tasks.task_names(),
+    algorithms=tuple(algorithms.ALGORITHMS),
+    memory_bytes=memory.available_memory(),
+  )
+
+
+def _check_episodes(episodes: int, seed: int) -> None:
+  if episodes < 1:
+    raise ConfigError(f"--episodes {episodes} must be at least 1")
+  if not 0 <= seed < 2**31:
+    raise ConfigError(f"--seed {seed} must be within 0 and 2**31 - 1")
+
+
+def _with_shortcuts(args: Train) -> TrainConfig:
+  config = args.config
+  env = {"backend": args.backend, "obs": args.obs}
+  env = {name: value for name, value in env.items() if value is not None}
+  config = dataclasses.replace(config, env=dataclasses.replace(config.env, **env))
+  if args.algorithm is None:
+    return config
+  agent = dataclasses.replace(config.agent, algorithm=args.algorithm)
+  return dataclasses.replace(config, agent=agent)
+
+
+@contextlib.contextmanager
+def _only_json(enabled: bool) -> Generator[Callable[[str], Any], None, None]:
+  """Yields how to write the result; with JSON, all other output goes to stderr.
+
+  The file descriptor itself is redirected, because libraries below Python print too.
+  """
+  if not enabled:
+    yield print
+    return
+  sys.stdout.flush()
+  stdout = os.dup(1)
+  os.dup2(2, 1)
+  try:
+    yield lambda text: os.write(stdout, (text + "\n").encode())
+  finally:
+    sys.stdout.flush()
+    os.dup2(stdout, 1)
+    os.close(stdout)
+
+
+def _to_json(result: Json) -> str:
+  return json.dumps(_plain(result), allow_nan=False)
+
+
+def _plain(value: Any) -> Any:
+  """``value`` as JSON can hold it: arrays as lists, paths as text, NaN as null."""
+  if hasattr(value, "tolist"):  # numpy, JAX
+    value = value.tolist()
+  if isinstance(value, dict):
+    return {str(key): _plain(item) for key, item in value.items()}
+  if isinstance(value, list | tuple):
+    return [_plain(item) for item in value]
+  if isinstance(value, float) and not math.isfinite(value):
+    return None
+  return value if isinstance(value, str | int | float | None) else str(value)
+
+
+def _show_figures(result: Json) -> str:
+  width = max(map(len, result), default=0)
+  return "\n".join(f"{name:<{width}}  {value}" for name, value in result.items())
+
+
+def _show_names(result: Json) -> str:
+  width = max(map(len, result))
+  return "\n".join(f"{kind:<{width}}  {' '.join(v)}" for kind, v in result.items())
+
+
+def _help() -> str:
+  lines = ["usage: apnpql COMMAND [options]", ""]
+  for name, (kind, _, _) in _COMMANDS.items():
+    lines.append(f"  {name:<9} {(kind.__doc__ or '').splitlines()[0]}")
+  lines += ["", "apnpql COMMAND --help shows its options."]
+  return "\n".join(lines)
+
+
+_COMMANDS: dict[str, tuple[type[Any], Callable[[Any, Sequence[str]], Json], Any]] = {
+  "train": (Train, train, _show_figures),
+  "evaluate": (Evaluate, evaluate, _show_figures),
+  "collect": (Collect, collect, _show_figures),
+  "list": (List, list_names, _show_names),
+}

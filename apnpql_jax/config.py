@@ -1,0 +1,234 @@
+"""Settings of a training run: frozen dataclasses, to and from JSON.
+
+Every field has a docstring because the command line shows it as help. This module
+imports neither JAX nor MuJoCo, so that ``apnpql --help`` is instant.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+from apnpql_jax import codec
+from apnpql_jax.codec import ConfigError as ConfigError
+from apnpql_jax.validation import (
+  BACKENDS as BACKENDS,
+  OBSERVATIONS as OBSERVATIONS,
+  check_name as check_name,
+  replay_bytes as replay_bytes,
+  validate as validate,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvConfig:
+  """The world the agent acts in."""
+
+  task: str = "push_plate"
+  """Task to solve; `apnpql list` names them."""
+
+  obs: str = "pixels"
+  """What the agent sees: pixels (two cameras) or state (privileged object poses)."""
+
+  backend: str = "auto"
+  """Physics engine: mjx, native (C MuJoCo), or auto (native on CPU, mjx elsewhere)."""
+
+  worlds: int = 32
+  """Worlds stepped at once."""
+
+  time_limit_s: float = 14.0
+  """Length of an episode in seconds; a time-out truncates."""
+
+  control_period_s: float = 0.15
+  """Time between two actions in seconds."""
+
+  bank_rows: int = 2048
+  """Reset states kept in the bank of a task (built once, cached on disk)."""
+
+  @property
+  def episode_steps(self) -> int:
+    """Actions in a full episode: whole control periods within the time limit."""
+    return int(math.floor(self.time_limit_s / self.control_period_s + 1e-6))
+
+
+@dataclasses.dataclass(frozen=True)
+class AgentConfig:
+  """The learner. Defaults are the paper's constants where it gives them."""
+
+  algorithm: str = "ap_npql"
+  """Policy-improvement scheme (a row of Table I); `apnpql list` names them."""
+
+  gamma: float = 0.99
+  """Discount per control period."""
+
+  n_step: int = 3
+  """Rewards summed before the value target bootstraps."""
+
+  learning_rate_e: float = 3e-4
+  """Adam rate of the E-step: features, action primitives, value."""
+
+  learning_rate_m: float = 3e-4
+  """Adam rate of the M-step: the parametric prior."""
+
+  learning_rate_alpha: float = 1e-4
+  """Adam rate of the temperature alpha (dual of the KL limit)."""
+
+  learning_rate_nu: float = 1e-4
+  """Adam rate of the multiplier nu (dual of the entropy floor)."""
+
+  target_rate: float = 0.05
+  """Share of the online network mixed into the target network at each update."""
+
+  target_samples: int = 120
+  """Candidate actions per state in the value target."""
+
+  policy_samples: int = 100
+  """Candidate actions per state when acting and in the alpha, M and nu updates."""
+
+  hidden: tuple[int, ...] = (256, 256)
+  """Widths of the hidden layers of each head."""
+
+  num_atoms: int = 51
+  """Atoms of the categorical value distribution."""
+
+  v_min: float = 0.0
+  """Smallest return the value distribution can express."""
+
+  v_max: float = 1.0
+  """Largest return the value distribution can express."""
+
+  epsilon: float = 1.0
+  """Limit of KL(q || prior) in nats; below log of the number of candidates."""
+
+  epsilon_nu: float = 0.0
+  """Entropy floor of the prior in nats."""
+
+  lambda_ap: float = 1.0
+  """Weight of the behaviour-cloning loss of the action primitives."""
+
+  feature_dim: int = 256
+  """Size of the shared feature vector phi."""
+
+  max_grad_norm: float = 10.0
+  """Gradients are scaled down to this global norm, each optimiser by itself."""
+
+  patch_channels: int = 32
+  """Channels of the first convolution (4x4 patches) of each camera."""
+
+  conv_channels: int = 32
+  """Channels of the second convolution of each camera."""
+
+  conv_overlap: bool = True
+  """Second convolution 3x3 with stride 2; else 2x2 patches, faster but coarser."""
+
+  ap_delta: float = 0.1
+  """Error in rad/s above which the loss of the action primitives becomes linear."""
+
+  min_std: float = 0.05
+  """Floor of the prior's Cholesky diagonal, rad/s."""
+
+  initial_std: float = 0.2
+  """The prior's Cholesky diagonal before training, rad/s."""
+
+  max_std: float = 0.5
+  """Limit of the prior's Cholesky entries, rad/s; the action box ends at 1."""
+
+  initial_alpha: float = 0.1
+  """Temperature before training, in units of return."""
+
+  min_alpha: float = 1e-3
+  """Floor of the temperature, in units of return: smaller differences of value are
+  taken for noise."""
+
+  initial_value: float = 0.05
+  """Expected return before training; low, for sparse reward has little to unlearn."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ReplayConfig:
+  """The agent's and the expert's replay."""
+
+  capacity: int = 51_200
+  """Slots of the agent replay over all worlds; a slot is one instant of one world."""
+
+  expert_steps: int = 6_400
+  """Slots of the expert replay, filled by the scripted expert before training."""
+
+  expert_share: float = 0.25
+  """Share of each batch drawn from the expert replay."""
+
+  batch_size: int = 64
+  """Transitions per update, both replays together."""
+
+  expert_noise: float = 0.1
+  """Standard deviation of the noise on the expert's joint velocities, rad/s."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+  """Everything that decides a run, apart from the machine."""
+
+  env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
+  """The world the agent acts in."""
+
+  agent: AgentConfig = dataclasses.field(default_factory=AgentConfig)
+  """The learner."""
+
+  replay: ReplayConfig = dataclasses.field(default_factory=ReplayConfig)
+  """The agent's and the expert's replay."""
+
+  seed: int = 0
+  """Seed of every random number of the run."""
+
+  total_steps: int = 200_000
+  """Environment steps to train for, summed over worlds."""
+
+  rollout_length: int = 8
+  """Control periods each world plays per iteration."""
+
+  updates_per_iteration: int = 16
+  """Learner updates per iteration."""
+
+  eval_every: int = 20_000
+  """Environment steps between two evaluations."""
+
+  eval_episodes: int = 64
+  """Held-out episodes per evaluation."""
+
+  checkpoint_every: int = 20_000
+  """Environment steps between two checkpoints."""
+
+  keep_checkpoints: int = 2
+  """Newest checkpoints kept on disk."""
+
+  video: bool = True
+  """Write a video of evaluation episodes."""
+
+
+def config_to_json(config: TrainConfig) -> str:
+  """The configuration as indented JSON text, nested like the dataclasses."""
+  return codec.to_json(config)
+
+
+def config_from_json(text: str) -> TrainConfig:
+  """Reads and validates what ``config_to_json`` wrote; nothing is executed.
+
+  Raises:
+    ConfigError: not JSON, a key unknown, missing or of the wrong type, or a
+      setting that cannot work.
+  """
+  config = codec.from_json(TrainConfig, text)
+  validate(config)
+  return config
+
+
+def config_diff(a: TrainConfig, b: TrainConfig) -> dict[str, tuple[Any, Any]]:
+  """Dotted field name -> (value in ``a``, value in ``b``) where the two differ."""
+  other = dict(codec.flatten(b))
+  return {k: (v, other[k]) for k, v in codec.flatten(a) if v != other[k]}
+
+
+def format_diff(diff: dict[str, tuple[Any, Any]]) -> str:
+  """One line such as ``agent.gamma 0.99 -> 0.95, seed 0 -> 1``."""
+  return ", ".join(f"{name} {a} -> {b}" for name, (a, b) in diff.items())

@@ -1,0 +1,1 @@
+"""Pure mathematics of the agent: distributions and their formulas, no networks."""

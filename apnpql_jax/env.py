@@ -1,0 +1,202 @@
+"""A batch of worlds of one task: reset, step, observe, start again.
+
+All functions are pure over ``EnvState`` and run inside jit; the world axis comes
+first. A step taken from a terminal instant resets that world to a random row of the
+bank and ignores the action, so terminal observations reach the replay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import functools
+
+from flax import struct
+import jax
+import jax.numpy as jnp
+
+from apnpql_jax.config import EnvConfig
+from apnpql_jax.primitives import tracking
+from apnpql_jax.primitives.bank import load_bank, ResetBank
+from apnpql_jax.render import CameraSpec, Geoms, Lighting, render
+from apnpql_jax.sim import arm, physics
+from apnpql_jax.sim.kinematics import Kinematics, make_kinematics
+from apnpql_jax.sim.physics import PhysicsState
+from apnpql_jax.sim.scene import Scene
+from apnpql_jax.tasks import make_task, Task
+from apnpql_jax.types import Array, Observation, TimeStep
+
+GLOBAL_SIZE = (72, 96)
+WRIST_SIZE = (36, 64)
+"""Height and width in pixels (paper Sec. V-A)."""
+
+HISTORY = 3
+"""Robot states stacked (paper Sec. V-A)."""
+
+HELD_OUT_SHARE = 0.25
+"""Share of the bank's rows that only evaluation sees."""
+
+Renderer = Callable[[Kinematics], Array]
+
+
+@struct.dataclass
+class EnvState:
+  """Everything the worlds need to go on."""
+
+  physics: PhysicsState  # [worlds, ...]
+  targets: Array  # f32[worlds, 3, 6]: joint targets of the primitives, rad
+  elapsed: Array  # i32[worlds]: control periods since the reset
+  timestep: TimeStep  # [worlds, ...]: the present instant
+
+
+class Env:
+  """The worlds of one task; holds constants only."""
+
+  def __init__(self, config: EnvConfig, task: Task, bank: ResetBank):
+    """
+    Args:
+      config: sizes, limits, backend and what is observed.
+      task: the task.
+      bank: its reset states.
+    """
+    scene = task.scene
+    substeps = round(config.control_period_s / scene.model.opt.timestep)
+    self.config = config
+    self.task = task
+    self.physics = physics.make_physics(config.backend, scene, substeps=substeps)
+    self._bank = bank
+    self._chain = arm.make_chain(scene)
+    self._kinematics = make_kinematics(scene)
+    self._cameras = (
+      camera_renderer(scene, "global", GLOBAL_SIZE),
+      camera_renderer(scene, "wrist", WRIST_SIZE),
+    )
+
+  @property
+  def training_rows(self) -> Array:
+    """i32[2]: first and one past the last bank row that training may use."""
+    return jnp.array([0, self.bank_split])
+
+  @property
+  def bank_split(self) -> int:
+    """Rows from here on are held out for evaluation."""
+    return int(self._bank.rows * (1 - HELD_OUT_SHARE))
+
+  @property
+  def held_out(self) -> int:
+    """Number of held-out rows."""
+    return self._bank.rows - self.bank_split
+
+  def reset(self, rows: Array) -> EnvState:
+    """Starts one world per bank row.
+
+    Args:
+      rows: i32[worlds].
+    """
+    state = self._initial(rows)
+    count = rows.shape[0]
+    arrival = EnvState(
+      physics=state,
+      targets=self._bank.targets[rows],
+      elapsed=jnp.zeros(count, jnp.int32),
+      timestep=None,
+    )
+    fresh = jnp.ones(count, bool)
+    history = jnp.zeros((count, HISTORY * 7))
+    return self._arrive(arrival, fresh, history)
+
+  def step(self, state: EnvState, action: Array, key: Array) -> EnvState:
+    """One control period in every world.
+
+    Args:
+      state: [worlds, ...].
+      action: f32[worlds, 7], see ``types.ACTION_DIM``.
+      key: draws the rows of worlds that start again.
+    """
+    reset = state.timestep.last
+    moved = self.physics.step(state.physics, action[:, :6], action[:, 6])
+    rows = jax.random.randint(key, reset.shape, 0, self.bank_split)
+    merge = functools.partial(_where, reset)
+    arrival = EnvState(
+      physics=jax.tree.map(merge, self._initial(rows), moved),
+      targets=merge(self._bank.targets[rows], state.targets),
+      elapsed=jnp.where(reset, 0, state.elapsed + 1),
+      timestep=None,
+    )
+    return self._arrive(arrival, reset, state.timestep.observation.robot)
+
+  def expert_action(self, state: EnvState) -> Array:
+    """f32[worlds, 7]: what the task's scripted expert does now."""
+    kinematics = self._kinematics(state.physics)
+    return self.task.expert(state.physics, kinematics, state.timestep.primitives)
+
+  def view(self, renderer: Renderer, state: PhysicsState) -> Array:
+    """u8[worlds, H, W, 3]: another look at the worlds, for videos."""
+    return renderer(self._kinematics(state))
+
+  def _initial(self, rows: Array) -> PhysicsState:
+    bank = self._bank
+    return physics.initial_state(
+      self.task.scene, bank.qpos[rows], bank.mocap_pos[rows], bank.mocap_quat[rows]
+    )
+
+  def _arrive(self, state: EnvState, fresh: Array, history: Array) -> EnvState:
+    """Judges, labels and observes the instant the worlds have come to."""
+    kinematics = self._kinematics(state.physics)
+    poses = self.task.tool_targets(state.physics, kinematics)
+    targets = tracking.refine(self._chain, state.targets, *poses)
+    q = state.physics.qpos[:, self.task.scene.arm_qpos]
+    solved = self.task.success(state.physics, kinematics) & ~fresh
+    late = (state.elapsed >= self.config.episode_steps) & ~fresh
+    timestep = TimeStep(
+      observation=self._observe(state.physics, kinematics, fresh, history),
+      reward=solved.astype(jnp.float32),
+      terminated=solved,
+      truncated=late & ~solved,
+      primitives=tracking.follow(targets, q[:, None]),
+    )
+    return state.replace(targets=targets, timestep=timestep)
+
+  def _observe(self, state, kinematics, fresh, history) -> Observation:
+    scene = self.task.scene
+    joints = state.qpos[:, jnp.append(scene.arm_qpos, scene.gripper_qpos)]
+    stacked = jnp.concatenate([history[:, 7:], joints], axis=-1)
+    robot = _where(fresh, jnp.tile(joints, (1, HISTORY)), stacked)
+    if self.config.obs == "state":
+      return Observation(robot=robot, objects=self.task.objects(state))
+    overview, wrist = (camera(kinematics) for camera in self._cameras)
+    return Observation(robot=robot, global_image=overview, wrist_image=wrist)
+
+
+def make_env(config: EnvConfig) -> Env:
+  """The worlds of ``config.task``; builds the reset bank on first use."""
+  task = make_task(config.task)
+  bank, _ = load_bank(task, config.bank_rows)
+  return Env(config, task, bank)
+
+
+def camera_renderer(scene: Scene, name: str, size: tuple[int, int]) -> Renderer:
+  """Returns ``f(kinematics) -> u8[worlds, H, W, 3]`` for a camera of the scene."""
+  index = scene.id("camera", name)
+  height, width = size
+  spec = CameraSpec.from_model(scene.model, name, height=height, width=width)
+  geoms = Geoms.from_model(scene.model)
+  lighting = Lighting.from_model(scene.model)
+
+  def renderer(kinematics: Kinematics) -> Array:
+    return render(
+      geoms,
+      spec,
+      kinematics.geom_xpos,
+      kinematics.geom_xmat,
+      kinematics.cam_xpos[:, index],
+      kinematics.cam_xmat[:, index],
+      lighting=lighting,
+    ).rgb
+
+  return renderer
+
+
+def _where(condition: Array, yes: Array, no: Array) -> Array:
+  """``jnp.where`` with a condition over the world axis only."""
+  shape = condition.shape + (1,) * (yes.ndim - condition.ndim)
+  return jnp.where(condition.reshape(shape), yes, no)

@@ -1,0 +1,81 @@
+"""Metrics to TensorBoard or Weights & Biases, for those who have installed them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from apnpql_jax.config import ConfigError, check_name
+from apnpql_jax.metrics import Sink
+
+
+class TensorboardSink:
+  """Event files in ``tensorboard/`` of the run folder (extra ``tb``)."""
+
+  def __init__(self, run_dir: Path, config: Mapping[str, Any]):
+    """Raises ConfigError if tensorboardX is missing."""
+    del config
+    try:
+      from tensorboardX import SummaryWriter
+    except ImportError:
+      raise _missing("tensorboardX", "tb") from None
+    self._writer = SummaryWriter(logdir=str(run_dir / "tensorboard"))
+
+  def write(self, step: int, row: Mapping[str, float]) -> None:
+    """One scalar per metric."""
+    for name, value in row.items():
+      self._writer.add_scalar(name, value, step)
+
+  def close(self) -> None:
+    """Flushes the event file."""
+    self._writer.close()
+
+
+class WandbSink:
+  """A run of the project ``apnpql_jax``, named like the folder (extra ``wandb``)."""
+
+  def __init__(self, run_dir: Path, config: Mapping[str, Any]):
+    """Raises ConfigError if wandb is missing."""
+    try:
+      import wandb
+    except ImportError:
+      raise _missing("wandb", "wandb") from None
+    self._run = wandb.init(
+      project="apnpql_jax", name=run_dir.name, dir=str(run_dir), config=dict(config)
+    )
+
+  def write(self, step: int, row: Mapping[str, float]) -> None:
+    """All metrics of the step at once."""
+    self._run.log(dict(row), step=step)
+
+  def close(self) -> None:
+    """Waits for the upload."""
+    self._run.finish()
+
+
+_SINKS = {"tensorboard": TensorboardSink, "wandb": WandbSink}
+
+
+def make_sinks(
+  names: Sequence[str], run_dir: Path, config: Mapping[str, Any]
+) -> list[Sink]:
+  """The sinks of these names, opened.
+
+  Args:
+    names: of ``tensorboard`` and ``wandb``.
+    run_dir: an existing run folder.
+    config: plain data shown beside the curves.
+
+  Raises:
+    ConfigError: an unknown name, or its package is not installed.
+  """
+  for name in names:
+    check_name("metric sink", name, list(_SINKS))
+  return [_SINKS[name](run_dir, config) for name in names]
+
+
+def _missing(package: str, extra: str) -> ConfigError:
+  return ConfigError(
+    f"{package} is not installed; install it with: pip install 'apnpql-jax[{extra}]'"
+  )

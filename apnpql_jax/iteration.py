@@ -1,0 +1,127 @@
+"""The state of a run and the one pure function that moves it on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import functools
+
+from flax import struct
+import jax
+import jax.numpy as jnp
+
+from apnpql_jax import replay
+from apnpql_jax.agents.learner import Agent, LearnerState
+from apnpql_jax.config import TrainConfig
+from apnpql_jax.env import Env, EnvState
+from apnpql_jax.replay import Replay, Slot
+from apnpql_jax.rollout import agent_policy, expert_policy, rollout
+from apnpql_jax.types import ACTION_DIM, Array, Metrics
+
+
+@struct.dataclass
+class TrainState:
+  """Everything needed to go on."""
+
+  learner: LearnerState
+  env: EnvState  # [worlds, ...]
+  replay: Replay
+  expert_replay: Replay | None
+  key: Array  # typed PRNG key
+  env_steps: Array  # i32[]: environment steps done, summed over worlds
+
+
+Iteration = Callable[[TrainState], tuple[TrainState, Metrics]]
+
+
+def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
+  """The jitted iteration (paper Algorithm 1): rollouts, then gradient steps.
+
+  The state is donated: the caller must go on with the one returned.
+  """
+  sample = functools.partial(
+    replay.sample_mixed,
+    batch_size=config.replay.batch_size,
+    expert_share=config.replay.expert_share,
+    n_step=config.agent.n_step,
+    gamma=config.agent.gamma,
+  )
+
+  def iteration(state: TrainState) -> tuple[TrainState, Metrics]:
+    key, rollout_key, update_key = jax.random.split(state.key, 3)
+    policy = agent_policy(agent, state.learner.params, greedy=False)
+    worlds, chunk = rollout(
+      env, policy, state.env, rollout_key, length=config.rollout_length
+    )
+    ring = replay.add(state.replay, chunk)
+
+    def update(learner: LearnerState, key: Array) -> tuple[LearnerState, Metrics]:
+      sample_key, learn_key = jax.random.split(key)
+      batch = sample(ring, state.expert_replay, sample_key)
+      return agent.update(learner, batch, learn_key)
+
+    keys = jax.random.split(update_key, config.updates_per_iteration)
+    learner, metrics = jax.lax.scan(update, state.learner, keys)
+    metrics = jax.tree.map(jnp.mean, metrics) | _rollout_metrics(chunk)
+    steps = config.rollout_length * config.env.worlds
+    return state.replace(
+      learner=learner,
+      env=worlds,
+      replay=ring,
+      key=key,
+      env_steps=state.env_steps + steps,
+    ), metrics
+
+  return jax.jit(iteration, donate_argnums=0)
+
+
+def _rollout_metrics(chunk: Slot) -> Metrics:
+  return {
+    "rollout/successes": chunk.timestep.terminated.sum(),
+    "rollout/timeouts": chunk.timestep.truncated.sum(),
+    "rollout/close_share": chunk.action[..., -1].mean(),
+  }
+
+
+def initial_state(config: TrainConfig, env: Env, agent: Agent) -> TrainState:
+  """The state before the first iteration, with the expert's replay filled."""
+  key, *keys = jax.random.split(jax.random.key(config.seed), 5)
+  rows = jax.random.randint(keys[0], (config.env.worlds,), 0, env.bank_split)
+  worlds = jax.jit(env.reset)(rows)
+  slot = example_slot(worlds)
+  length = config.replay.capacity // config.env.worlds
+  return TrainState(
+    learner=jax.jit(agent.init)(keys[1], worlds.timestep.observation),
+    env=worlds,
+    replay=replay.create(slot, length, config.env.worlds),
+    expert_replay=collect_expert(config, env, keys[2]),
+    key=key,
+    env_steps=jnp.zeros((), jnp.int32),
+  )
+
+
+def example_slot(worlds: EnvState) -> Slot:
+  """Shapes and dtypes of one replay slot of one world."""
+  action = jax.ShapeDtypeStruct((ACTION_DIM,), jnp.float32)
+  timestep = jax.tree.map(
+    lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), worlds.timestep
+  )
+  return Slot(timestep=timestep, action=action)
+
+
+def collect_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:
+  """The expert's replay: ``replay.expert_steps`` slots of its noisy episodes."""
+  worlds = config.env.worlds
+  length = config.replay.expert_steps // worlds
+  if not length:
+    return None
+  policy = expert_policy(env, noise=config.replay.expert_noise)
+
+  @jax.jit
+  def collect(key: Array) -> Replay:
+    row_key, play_key = jax.random.split(key)
+    rows = jax.random.randint(row_key, (worlds,), 0, env.bank_split)
+    state = env.reset(rows)
+    _, chunk = rollout(env, policy, state, play_key, length=length)
+    return replay.add(replay.create(example_slot(state), length, worlds), chunk)
+
+  return collect(key)

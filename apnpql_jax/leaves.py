@@ -1,0 +1,70 @@
+"""State pytrees for storage: a name and a kind for each leaf, keys as plain arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+
+def describe(tree: Any) -> dict[str, str]:
+  """Path of each leaf -> dtype and shape, such as ``uint8[4, 72, 96, 3]``."""
+  return {
+    _name(path): f"{leaf.dtype}{list(leaf.shape)}"
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
+  }
+
+
+def key_impls(tree: Any) -> dict[str, str]:
+  """Path of each typed PRNG key -> name of its generator."""
+  return {
+    _name(path): str(jax.random.key_impl(leaf))
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
+    if _is_key(leaf)
+  }
+
+
+def to_plain(tree: Any) -> Any:
+  """The tree with the data of typed keys (u32) in their place."""
+  return jax.tree.map(_key_data, tree)
+
+
+def to_typed(tree: Any, impls: Mapping[str, str]) -> Any:
+  """Undoes ``to_plain``, given the ``key_impls`` of the original tree."""
+
+  def wrap(path: Any, leaf: jax.Array) -> jax.Array:
+    impl = impls.get(_name(path))
+    return leaf if impl is None else jax.random.wrap_key_data(leaf, impl=impl)
+
+  return jax.tree_util.tree_map_with_path(wrap, tree)
+
+
+def abstract(tree: Any) -> Any:
+  """ShapeDtypeStructs of ``to_plain(tree)``, each on its leaf's devices.
+
+  Leaves that name no device, and keys, are put on the default one.
+  """
+  default = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+
+  def struct(leaf: Any) -> jax.ShapeDtypeStruct:
+    plain = jax.eval_shape(_key_data, leaf)
+    sharding = None if _is_key(leaf) else getattr(leaf, "sharding", None)
+    return jax.ShapeDtypeStruct(
+      plain.shape, plain.dtype, sharding=default if sharding is None else sharding
+    )
+
+  return jax.tree.map(struct, tree)
+
+
+def _key_data(leaf: Any) -> Any:
+  return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+
+
+def _is_key(leaf: Any) -> bool:
+  return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _name(path: Any) -> str:
+  return jax.tree_util.keystr(path, simple=True, separator="/")

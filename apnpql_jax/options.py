@@ -1,0 +1,159 @@
+"""Options of the command line, and their parsing with one-line errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import contextlib
+import dataclasses
+import io
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+import tyro
+
+from apnpql_jax.config import ConfigError, TrainConfig
+
+T = TypeVar("T")
+_Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+_PRESET_HINT = tyro.conf.arg(help_behavior_hint="(default: as the preset says)")
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+  """Trains an agent: apnpql train PRESET [options].
+
+  Every setting of the preset can be overridden, e.g. --agent.epsilon 0.5.
+  """
+
+  preset: tyro.conf.Positional[str] = ""
+  """Settings to start from; `apnpql list` names them."""
+
+  run: Annotated[
+    Path | None,
+    tyro.conf.arg(help_behavior_hint="(default: first free runs/PRESET-<n>)"),
+  ] = None
+  """Folder for everything the run writes."""
+
+  resume: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="")] = None
+  """Run folder to go on with, from its newest checkpoint."""
+
+  overwrite: _Flag = False
+  """Replace the run that --run holds."""
+
+  backend: Annotated[str | None, _PRESET_HINT] = None
+  """Short for --env.backend: auto, mjx or native."""
+
+  obs: Annotated[str | None, _PRESET_HINT] = None
+  """Short for --env.obs: pixels or state."""
+
+  algorithm: Annotated[str | None, _PRESET_HINT] = None
+  """Short for --agent.algorithm; `apnpql list` names them."""
+
+  json: _Flag = False
+  """Print one JSON object on standard output and nothing else there."""
+
+  config: Annotated[TrainConfig, tyro.conf.arg(name="")] = dataclasses.field(
+    default_factory=TrainConfig
+  )
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluate:
+  """Plays held-out episodes with a trained agent: apnpql evaluate RUN [options]."""
+
+  run: tyro.conf.Positional[str] = ""
+  """Run folder; its newest checkpoint is played."""
+
+  episodes: int = 200
+  """Episodes to play."""
+
+  seed: int = 0
+  """Seed of the episodes and of the policy."""
+
+  backend: Annotated[
+    str | None, tyro.conf.arg(help_behavior_hint="(default: as in training)")
+  ] = None
+  """Physics engine: auto, mjx or native."""
+
+  json: _Flag = False
+  """Print one JSON object on standard output and nothing else there."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Collect:
+  """Plays episodes with the scripted expert: apnpql collect TASK [options]."""
+
+  task: tyro.conf.Positional[str] = ""
+  """Task to play; `apnpql list` names them."""
+
+  episodes: int = 200
+  """Episodes to play."""
+
+  seed: int = 0
+  """Seed of the episodes and of the noise."""
+
+  backend: str = "auto"
+  """Physics engine: auto, mjx or native."""
+
+  noise: float = 0.0
+  """Standard deviation of the noise on the expert's joint velocities, rad/s."""
+
+  json: _Flag = False
+  """Print one JSON object on standard output and nothing else there."""
+
+
+@dataclasses.dataclass(frozen=True)
+class List:
+  """Names the tasks, presets, algorithms and backends."""
+
+  json: _Flag = False
+  """Print one JSON object on standard output and nothing else there."""
+
+
+def parse(kind: type[T], name: str, argv: Sequence[str], default: T | None = None) -> T:
+  """Parses the options of one command, on top of ``default``.
+
+  Args:
+    kind: one of the dataclasses above.
+    name: the command, for help and errors.
+    argv: what follows it on the command line.
+    default: an instance of ``kind``; its own defaults if None.
+
+  Raises:
+    ConfigError: an unknown, incomplete or unreadable option (tyro's boxed message
+      as one line).
+    SystemExit: ``--help`` was asked for and printed.
+  """
+  errors = io.StringIO()
+  try:
+    with contextlib.redirect_stderr(errors):
+      return tyro.cli(
+        kind,
+        args=list(argv),
+        prog=f"apnpql {name}",
+        default=kind() if default is None else default,
+        config=(tyro.conf.DisallowNone,),
+      )
+  except SystemExit as stop:
+    if stop.code in (0, None):  # --help was printed
+      raise
+    raise ConfigError(
+      f"{_unbox(errors.getvalue())} (see apnpql {name} --help)"
+    ) from None
+
+
+def _unbox(text: str) -> str:
+  """The message of an error box: its first section, and the first suggestion."""
+  rows = [line.strip("│ ") for line in text.splitlines() if line.startswith("│")]
+  sections: list[list[str]] = [[]]
+  for row in rows:
+    if row and not row.strip("─"):
+      sections.append([])
+    else:
+      sections[-1].append(row)
+  message = " ".join(sections[0]) or " ".join(text.split()) or "bad options"
+  for section in sections[1:]:
+    options = [row for row in section if row.startswith("--")]
+    if section[0].startswith("Perhaps you meant") and options:
+      message += f"; perhaps you meant {options[0]}"
+  return message

@@ -1,0 +1,182 @@
+"""Reset states with the joint targets of their primitives, built once per task.
+
+Inside jit a reset is then a gather of a random row: true random resets at no cost
+on every backend.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import dataclasses
+import hashlib
+import json
+import multiprocessing
+import os
+import pathlib
+import tempfile
+from typing import TYPE_CHECKING
+
+from flax import struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+
+from apnpql_jax.primitives import ik
+from apnpql_jax.runtime import cache_dir
+from apnpql_jax.sim import physics
+from apnpql_jax.sim.kinematics import make_kinematics
+from apnpql_jax.sim.native import NativePhysics
+from apnpql_jax.types import Array
+
+if TYPE_CHECKING:  # Tasks know the primitives, so only the type may be known here.
+  from apnpql_jax.tasks.task import Task
+
+VERSION = 1
+"""Raised when the meaning of a bank changes; part of the cache key."""
+
+SEED = 0
+CHUNK = 32
+SETTLE_PERIODS = 4
+"""Control periods of 0.15 s at rest before a draw is accepted."""
+SETTLE_SPEED = 0.05
+"""m/s and rad/s; above float32 contact noise (0.04)."""
+
+
+@struct.dataclass
+class ResetBank:
+  """Settled initial states and where their primitives lead."""
+
+  qpos: Array  # f32[rows, nq]
+  mocap_pos: Array  # f32[rows, nmocap, 3]
+  mocap_quat: Array  # f32[rows, nmocap, 4]
+  targets: Array  # f32[rows, 3, 6], rad
+
+  @property
+  def rows(self) -> int:
+    """Number of reset states."""
+    return self.qpos.shape[0]
+
+
+@dataclasses.dataclass
+class BankReport:
+  """How a bank came about."""
+
+  drawn: int = 0
+  rejected_restless: int = 0
+  rejected_unreachable: int = 0
+  max_position_residual: float = 0.0
+  max_rotation_residual: float = 0.0
+
+
+def load_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
+  """The task's bank from the user's cache, building it first if it is not there."""
+  path = _cache_path(task, rows)
+  if path.exists():
+    with np.load(path, allow_pickle=False) as stored:
+      bank = ResetBank(
+        **{f: jnp.asarray(stored[f]) for f in ResetBank.__dataclass_fields__}
+      )
+      return bank, BankReport(**json.loads(str(stored["report"])))
+  bank, report = build_bank(task, rows)
+  _store(path, bank, report)
+  return bank, report
+
+
+def build_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
+  """Draws, settles and solves ``rows`` reset states, with a progress bar on stderr."""
+  rng = np.random.default_rng(SEED)
+  report = BankReport()
+  kept: list[ResetBank] = []
+  # Spawned workers: forking a process in which XLA threads run can deadlock.
+  context = multiprocessing.get_context("spawn")
+  with (
+    concurrent.futures.ProcessPoolExecutor(os.cpu_count(), context) as pool,
+    Progress(console=Console(stderr=True)) as progress,
+  ):
+    bar = progress.add_task(f"reset bank of {task.name}", total=rows)
+    while (missing := rows - sum(bank.rows for bank in kept)) > 0:
+      draw = _settled(task, rng, max(missing, CHUNK), report)
+      solved = _solve_targets(
+        task, draw, pool, report, lambda n: progress.advance(bar, n)
+      )
+      kept.append(jax.tree.map(lambda x: x[:missing], solved))
+  return jax.tree.map(lambda *parts: jnp.concatenate(parts), *kept), report
+
+
+def _settled(task: Task, rng, count: int, report: BankReport) -> physics.PhysicsState:
+  """States that stay where they are while the arm holds still."""
+  draw = [jnp.asarray(x, jnp.float32) for x in task.sample_resets(rng, count)]
+  state = physics.initial_state(task.scene, *draw)
+  engine = NativePhysics(task.scene, substeps=30)
+  closed = state.qpos[:, task.scene.gripper_qpos] > 0.5
+  for _ in range(SETTLE_PERIODS):
+    state = engine.step(state, jnp.zeros((count, 6)), closed.astype(jnp.float32))
+  restless = np.abs(np.asarray(state.qvel)).max(-1) > SETTLE_SPEED
+  report.drawn += count
+  report.rejected_restless += int(restless.sum())
+  return jax.tree.map(lambda x: x[~restless], state)
+
+
+def _solve_targets(task, state, pool, report: BankReport, advance) -> ResetBank:
+  kinematics = jax.jit(make_kinematics(task.scene))(state)
+  positions, rotations = map(np.asarray, task.tool_targets(state, kinematics))
+  starts = np.asarray(state.qpos[:, task.scene.arm_qpos])
+  chunks = [slice(i, i + CHUNK) for i in range(0, len(starts), CHUNK)]
+  futures = [
+    pool.submit(_solve_chunk, starts[c], positions[c], rotations[c]) for c in chunks
+  ]
+  for future in concurrent.futures.as_completed(futures):
+    advance(len(future.result()[0]))
+  targets, residuals = (
+    np.concatenate(parts)
+    for parts in zip(*[future.result() for future in futures], strict=True)
+  )
+  reached = (residuals < [ik.POSITION_TOLERANCE, ik.ROTATION_TOLERANCE]).all((1, 2))
+  report.rejected_unreachable += int((~reached).sum())
+  worst = residuals[reached].max((0, 1))
+  report.max_position_residual = max(report.max_position_residual, float(worst[0]))
+  report.max_rotation_residual = max(report.max_rotation_residual, float(worst[1]))
+  return ResetBank(
+    qpos=state.qpos[reached],
+    mocap_pos=state.mocap_pos[reached],
+    mocap_quat=state.mocap_quat[reached],
+    targets=jnp.asarray(targets[reached], jnp.float32),
+  )
+
+
+def _solve_chunk(starts, positions, rotations) -> tuple[np.ndarray, np.ndarray]:
+  """Targets f64[n, 3, 6] and residuals f64[n, 3, 2]; runs in a worker process."""
+  solver = ik.IkSolver()
+  results = [
+    [solver.solve(start, pos, mat) for pos, mat in zip(p, r, strict=True)]
+    for start, p, r in zip(starts, positions, rotations, strict=True)
+  ]
+  q = np.array([[result.q for result in row] for row in results])
+  residuals = np.array(
+    [[(x.position_residual, x.rotation_residual) for x in row] for row in results]
+  )
+  return q, residuals
+
+
+def _cache_path(task: Task, rows: int) -> pathlib.Path:
+  key = json.dumps([VERSION, SEED, rows, task.name, task.scene.fingerprint, _source(task)])
+  digest = hashlib.sha256(key.encode()).hexdigest()[:16]
+  return cache_dir() / "banks" / f"{task.name}-{rows}-{digest}.npz"
+
+
+def _source(task: Task) -> str:
+  """The task's own file: its ranges and tool targets decide what a bank holds."""
+  module = type(task).__module__
+  path = pathlib.Path(__import__(module, fromlist=["_"]).__file__)
+  return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _store(path: pathlib.Path, bank: ResetBank, report: BankReport) -> None:
+  """Writes atomically, so that two runs at once never see half a file."""
+  path.parent.mkdir(parents=True, exist_ok=True)
+  arrays = {f: np.asarray(getattr(bank, f)) for f in ResetBank.__dataclass_fields__}
+  with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".npz", delete=False) as file:
+    np.savez(file, report=json.dumps(dataclasses.asdict(report)), **arrays)
+  os.replace(file.name, path)

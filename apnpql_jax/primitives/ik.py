@@ -1,0 +1,88 @@
+"""Inverse kinematics on the host, by mink.
+
+No JAX in here: worker processes import this module.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import mink
+import mujoco
+import numpy as np
+
+from apnpql_jax.presets import mjcf_path
+
+TOOL_SITE = "tool"
+MAX_ITERATIONS = 60
+POSITION_TOLERANCE = 1e-3
+"""m; residual above which a target counts as unreachable."""
+ROTATION_TOLERANCE = np.deg2rad(0.5)
+"""rad; likewise."""
+POSTURE_COST = 1e-4
+"""Against position and orientation costs of 1: decides only the null space and, at
+unreachable poses, keeps the arm near its start."""
+
+
+@dataclasses.dataclass(frozen=True)
+class IkResult:
+  """A configuration and how far its tool is from the pose asked for."""
+
+  q: np.ndarray  # f64[6], rad
+  position_residual: float  # m
+  rotation_residual: float  # rad
+
+  @property
+  def reached(self) -> bool:
+    """Within 1 mm and 0.5 degrees."""
+    return (
+      self.position_residual < POSITION_TOLERANCE
+      and self.rotation_residual < ROTATION_TOLERANCE
+    )
+
+
+class IkSolver:
+  """Differential IK of the robot's tool site with posture and joint limits."""
+
+  def __init__(self):
+    model = mujoco.MjModel.from_xml_path(str(mjcf_path("robot")))
+    self._configuration = mink.Configuration(model)
+    self._pose = mink.FrameTask(
+      TOOL_SITE, "site", position_cost=1.0, orientation_cost=1.0, lm_damping=1e-6
+    )
+    self._posture = mink.PostureTask(model, cost=POSTURE_COST)
+    self._limits = [mink.ConfigurationLimit(model)]
+
+  def solve(self, start: np.ndarray, pos: np.ndarray, mat: np.ndarray) -> IkResult:
+    """Configuration nearest to ``start`` that puts the tool at a pose.
+
+    Args:
+      start: f64[6], rad; also the preferred posture.
+      pos: f64[3], tool position in the world frame, m.
+      mat: f64[3, 3], tool rotation in the world frame.
+    """
+    configuration = self._configuration
+    q = np.zeros(configuration.model.nq)
+    q[: len(start)] = start
+    configuration.update(q)
+    self._posture.set_target(q)
+    rotation = mink.SO3.from_matrix(np.asarray(mat, np.float64))
+    self._pose.set_target(
+      mink.SE3.from_rotation_and_translation(rotation, np.asarray(pos, np.float64))
+    )
+    for _ in range(MAX_ITERATIONS):
+      error = self._pose.compute_error(configuration)
+      residuals = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
+      if residuals[0] < 1e-5 and residuals[1] < 1e-4:
+        break
+      # A unit step with a unit time constant: one Gauss-Newton step per iteration.
+      velocity = mink.solve_ik(
+        configuration,
+        [self._pose, self._posture],
+        1.0,
+        solver="daqp",
+        damping=1e-9,
+        limits=self._limits,
+      )
+      configuration.integrate_inplace(velocity, 1.0)
+    return IkResult(configuration.q[: len(start)].copy(), *map(float, residuals))

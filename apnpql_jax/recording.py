@@ -1,0 +1,63 @@
+"""Videos of episodes: a larger view beside what both cameras see."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from apnpql_jax.env import camera_renderer, Env, EnvState
+from apnpql_jax.render.video import tile, write_video
+from apnpql_jax.rollout import Policy
+from apnpql_jax.types import Array
+
+EPISODES = 4
+VIEW_SIZE = (216, 288)
+"""Height and width of the larger view, three times the global camera's."""
+
+
+def record_episodes(env: Env, policy: Policy, path: Path) -> None:
+  """Plays held-out episodes one after another and writes them as one video.
+
+  Args:
+    env: the worlds.
+    policy: what acts.
+    path: of the file to write; its folder is made.
+  """
+  rows = env.bank_split + jnp.arange(EPISODES)
+  states, running = jax.jit(lambda key: _play(env, policy, rows, key))(
+    jax.random.key(0)
+  )
+  cameras = (
+    camera_renderer(env.task.scene, "global", VIEW_SIZE),
+    camera_renderer(env.task.scene, "global", (72, 96)),
+    camera_renderer(env.task.scene, "wrist", (36, 64)),
+  )
+  draw = jax.jit(lambda physics: [env.view(camera, physics) for camera in cameras])
+  frames = []
+  for episode in range(EPISODES):
+    steps = int(running[:, episode].sum())
+    physics = jax.tree.map(lambda x: x[:, episode], states)  # noqa: B023
+    images = [np.asarray(view)[: steps + 1] for view in draw(physics)]
+    frames.append(tile(images))
+  path.parent.mkdir(parents=True, exist_ok=True)
+  write_video(path, np.concatenate(frames), fps=1 / env.config.control_period_s)
+
+
+def _play(
+  env: Env, policy: Policy, rows: Array, key: Array
+) -> tuple[EnvState, Array]:
+  """Physics states [time, episodes, ...] and which episodes were still running."""
+
+  def period(carry, key):
+    state, running = carry
+    policy_key, env_key = jax.random.split(key)
+    moved = env.step(state, policy(state, policy_key), env_key)
+    running = running & ~state.timestep.last
+    return (moved, running), (state.physics, running)
+
+  start = (env.reset(rows), jnp.ones(EPISODES, bool))
+  keys = jax.random.split(key, env.config.episode_steps + 1)
+  return jax.lax.scan(period, start, keys)[1]

@@ -1,0 +1,221 @@
+"""Static description of what the ray caster draws: geoms, cameras and light.
+
+Everything here is numpy or plain Python, read once from a ``mujoco.MjModel`` and
+closed over by the compiled program; only poses are arguments of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import dataclasses
+
+import mujoco
+import numpy as np
+
+_TYPES = mujoco.mjtGeom
+SUPPORTED = (
+  _TYPES.mjGEOM_PLANE,
+  _TYPES.mjGEOM_SPHERE,
+  _TYPES.mjGEOM_CAPSULE,
+  _TYPES.mjGEOM_BOX,
+  _TYPES.mjGEOM_CYLINDER,
+)
+"""Geom types that have a closed-form intersection here."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Geoms:
+  """The visible geoms of a model. Hashed by identity, so that it may be static.
+
+  ``n`` geoms are drawn, ordered by type and then by MuJoCo id.
+  """
+
+  ids: np.ndarray
+  """i32[n]: MuJoCo geom ids."""
+  types: np.ndarray
+  """i32[n]: ``mujoco.mjtGeom``, sorted."""
+  sizes: np.ndarray
+  """f32[n, 3]: MuJoCo half sizes in metres."""
+  colors: np.ndarray
+  """f32[n, 3]: red, green, blue in [0, 1]. Every visible geom is drawn opaque."""
+  checker: np.ndarray
+  """f32[n]: edge of a checker's squares in metres, 0 for a plain geom."""
+  checker_colors: np.ndarray
+  """f32[n, 3]: colour of the squares where floor(x) + floor(y) is odd."""
+
+  @classmethod
+  def from_model(
+    cls, model: mujoco.MjModel, groups: Sequence[int] = (0, 1, 2)
+  ) -> Geoms:
+    """Reads the visible geoms: alpha above zero and group in ``groups``.
+
+    Args:
+      model: compiled MuJoCo model.
+      groups: geom groups to draw; the default is what MuJoCo's viewer draws.
+
+    Returns:
+      The static description.
+
+    Raises:
+      ValueError: a visible geom has a type without closed-form intersection, or a
+        texture other than a checker on a plane.
+    """
+    rgba = _effective_rgba(model)
+    visible = (rgba[:, 3] > 0) & np.isin(model.geom_group, groups)
+    ids = np.flatnonzero(visible)
+    ids = ids[np.argsort(model.geom_type[ids], kind="stable")]
+    _refuse_unsupported(model, ids)
+    colors, odd_colors = rgba[ids, :3].copy(), np.zeros((len(ids), 3))
+    checker = np.zeros(len(ids))
+    for k, i in enumerate(ids):
+      texture = _texture_id(model, i)
+      if texture >= 0:
+        checker[k], even, odd = _read_checker(model, i, texture)
+        colors[k], odd_colors[k] = colors[k] * even, colors[k] * odd
+    return cls(
+      ids=ids.astype(np.int32),
+      types=model.geom_type[ids].astype(np.int32),
+      sizes=model.geom_size[ids].astype(np.float32),
+      colors=colors.astype(np.float32),
+      checker=checker.astype(np.float32),
+      checker_colors=odd_colors.astype(np.float32),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraSpec:
+  """A perspective camera: looks along -z of its frame, +x right, +y up."""
+
+  name: str
+  id: int
+  height: int
+  """Pixels."""
+  width: int
+  """Pixels; they are square, so the width sets the horizontal field of view."""
+  fovy_deg: float
+  """Vertical field of view in degrees, as in MJCF."""
+
+  @classmethod
+  def from_model(
+    cls, model: mujoco.MjModel, name: str, *, height: int, width: int
+  ) -> CameraSpec:
+    """Reads a camera by name.
+
+    Raises:
+      ValueError: the model has no such camera, it is not a plain perspective
+        camera, or the image would be empty.
+    """
+    names = [model.camera(i).name for i in range(model.ncam)]
+    if name not in names:
+      raise ValueError(f"no camera {name!r} in the model; it has {names}")
+    if height < 1 or width < 1:
+      raise ValueError(f"image of camera {name!r} is empty: {height}x{width}")
+    i = names.index(name)
+    perspective = mujoco.mjtProjection.mjPROJ_PERSPECTIVE
+    if model.cam_projection[i] != perspective or model.cam_sensorsize[i].any():
+      raise ValueError(f"camera {name!r} must be perspective and set by fovy alone")
+    return cls(name, i, height, width, float(model.cam_fovy[i]))
+
+
+@dataclasses.dataclass(frozen=True)
+class Lighting:
+  """Ambient light, one directional light, background and shadows.
+
+  Intensity on a surface with unit normal n, where l points towards the light, is
+  ``ambient + diffuse * max(n.l, -fill * n.l)``.
+  """
+
+  direction: tuple[float, float, float] = (0.3, 0.4, -1.0)
+  """World direction in which the light travels; need not be a unit vector."""
+  ambient: float = 0.35
+  """Intensity in the dark."""
+  diffuse: float = 0.65
+  """Intensity added where the light falls in straight."""
+  fill: float = 0.3
+  """Share of ``diffuse`` seen by surfaces turned straight away from the light;
+  without it they would all have one flat colour."""
+  background: tuple[float, float, float] = (0.55, 0.65, 0.75)
+  """Colour of rays that hit nothing, in [0, 1]."""
+  shadow_casters: tuple[int, ...] = ()
+  """MuJoCo ids of geoms that throw a hard shadow on planes: spheres, capsules and
+  boxes on the lit side of the plane. Empty means no shadows and no cost."""
+  shadow: float = 0.4
+  """Share of the intensity that a shadow takes away."""
+
+  def __post_init__(self):
+    shares = (self.ambient, self.diffuse, self.fill, self.shadow, *self.background)
+    if any(not 0.0 <= x <= 1.0 for x in shares) or self.ambient + self.diffuse > 1.0:
+      raise ValueError(
+        "light intensities must lie in [0, 1] and ambient + diffuse must not pass 1, "
+        f"got {self}"
+      )
+    if not np.any(self.direction):
+      raise ValueError("the light direction must not be zero")
+
+  @classmethod
+  def from_model(cls, model: mujoco.MjModel, **settings) -> Lighting:
+    """Takes the direction of the model's only directional light.
+
+    Args:
+      model: compiled MuJoCo model.
+      **settings: values of the other fields.
+
+    Raises:
+      ValueError: the model does not have exactly one directional light, or the
+        light is fixed to a moving body.
+    """
+    lights = np.flatnonzero(
+      model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    )
+    if len(lights) != 1 or model.light_bodyid[lights[0]] != 0:
+      raise ValueError("the scene needs exactly one directional light, in the world")
+    direction = tuple(float(x) for x in model.light_dir[lights[0]])
+    return cls(direction=direction, **settings)
+
+
+def _effective_rgba(model: mujoco.MjModel) -> np.ndarray:
+  """f32[ngeom, 4]: as MuJoCo's viewer does, a material counts where rgba is default."""
+  rgba = model.geom_rgba.copy()
+  default = np.all(rgba == np.array([0.5, 0.5, 0.5, 1.0], rgba.dtype), axis=1)
+  use_material = (model.geom_matid >= 0) & default
+  rgba[use_material] = model.mat_rgba[model.geom_matid[use_material]]
+  return rgba
+
+
+def _refuse_unsupported(model: mujoco.MjModel, ids: np.ndarray) -> None:
+  for i in ids:
+    kind = _TYPES(int(model.geom_type[i]))
+    name = model.geom(i).name or f"geom {i}"
+    if kind not in SUPPORTED:
+      valid = ", ".join(t.name for t in SUPPORTED)
+      raise ValueError(f"cannot draw {name!r}: {kind.name} is none of {valid}")
+    if _texture_id(model, i) >= 0 and kind != _TYPES.mjGEOM_PLANE:
+      raise ValueError(f"cannot draw the texture of {name!r}: only planes have one")
+
+
+def _texture_id(model: mujoco.MjModel, geom_id: int) -> int:
+  material = model.geom_matid[geom_id]
+  if material < 0:
+    return -1
+  return int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB])
+
+
+def _read_checker(
+  model: mujoco.MjModel, geom_id: int, texture: int
+) -> tuple[float, np.ndarray, np.ndarray]:
+  """Edge in metres and the colours of even and odd squares of a checkered plane."""
+  height, width = model.tex_height[texture], model.tex_width[texture]
+  channels, start = model.tex_nchannel[texture], model.tex_adr[texture]
+  data = model.tex_data[start : start + height * width * channels]
+  data = data.reshape(height, width, channels)[..., :3]
+  odd, even = data[height // 4, width // 4], data[height // 4, 3 * width // 4]
+  row, column = np.arange(height) * 2 // height, np.arange(width) * 2 // width
+  expected = np.where(((row[:, None] + column) % 2 == 0)[..., None], odd, even)
+  material = model.geom_matid[geom_id]
+  repeat = model.mat_texrepeat[material]
+  size = model.geom_size[geom_id, :2]
+  scale = np.where((size > 0) & ~model.mat_texuniform[material], size, 1.0) / repeat
+  if not np.array_equal(data, expected) or scale[0] != scale[1]:
+    name = model.geom(geom_id).name or f"geom {geom_id}"
+    raise ValueError(f"cannot draw the texture of {name!r}: not a square checker")
+  return float(scale[0]), even / 255.0, odd / 255.0

@@ -1,0 +1,75 @@
+"""Hard shadows of chosen geoms on planes, under a directional light.
+
+The light's rays are parallel, so a plane's point is in the shadow of a capsule where
+the two are close after projection along the light: no root is needed. The caster
+must be on the lit side of the plane.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from apnpql_jax.render.intersect import Frames, Rays, along
+
+Array = jax.Array
+
+_TINY = 1e-12
+
+
+def light_basis(direction: tuple[float, float, float]) -> np.ndarray:
+  """f32[3, 3]: rows e1, e2 across the light and l towards it, in world axes."""
+  toward = -np.asarray(direction, np.float64)
+  toward /= np.linalg.norm(toward)
+  helper = np.eye(3)[np.argmin(np.abs(toward))]
+  e1 = np.cross(helper, toward)
+  e1 /= np.linalg.norm(e1)
+  return np.stack([e1, np.cross(toward, e1), toward]).astype(np.float32)
+
+
+def capsule_shadow(g: Frames, rays: Rays, t: Array, basis: Array) -> Array:
+  """bool[P]: whether a capsule (or a sphere, with half length 0) darkens a point.
+
+  Args:
+    g: the caster.
+    rays: rays of the image.
+    t: f32[P], depth of the point on each ray.
+    basis: f32[3, 3], ``light_basis`` in the camera's frame.
+
+  Returns:
+    True where the segment towards the light meets the caster.
+  """
+  axis = [(g.z * basis[k]).sum() for k in range(2)]
+  center = [(g.center * basis[k]).sum() for k in range(2)]
+  inv = 1.0 / (axis[0] * axis[0] + axis[1] * axis[1] + _TINY)
+  x, y = (t * along(basis[k], rays) - center[k] for k in range(2))
+  s = jnp.clip((x * axis[0] + y * axis[1]) * inv, -g.size[1], g.size[1])
+  x, y = x - s * axis[0], y - s * axis[1]
+  return x * x + y * y < g.size[0] * g.size[0]
+
+
+def box_shadow(g: Frames, rays: Rays, t: Array, basis: Array) -> Array:
+  """bool[P]: whether a box darkens a point; arguments as of ``capsule_shadow``."""
+  del basis
+  enter, leave = [], []
+  for k, axis in enumerate((g.x, g.y, g.z)):
+    inv = 1.0 / (g.light[k] + _TINY)
+    middle = (g.offset[k] - t * along(axis, rays)) * inv
+    width = g.size[k] * jnp.abs(inv)
+    enter.append(middle - width)
+    leave.append(middle + width)
+  first = jnp.maximum(jnp.maximum(enter[0], enter[1]), enter[2])
+  last = jnp.minimum(jnp.minimum(leave[0], leave[1]), leave[2])
+  return (first <= last) & (last > 0.0)
+
+
+SHADOWS: dict[int, Callable[[Frames, Rays, Array, Array], Array]] = {
+  int(mujoco.mjtGeom.mjGEOM_SPHERE): capsule_shadow,
+  int(mujoco.mjtGeom.mjGEOM_CAPSULE): capsule_shadow,
+  int(mujoco.mjtGeom.mjGEOM_BOX): box_shadow,
+}
+"""Shadow test by ``mujoco.mjtGeom``."""

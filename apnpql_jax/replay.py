@@ -1,0 +1,200 @@
+"""Replay: a ``[time, world]`` ring that keeps each frame once.
+
+A slot at time t holds (TimeStep_t, action_t); the reward and the end flags of
+TimeStep_t were received on arriving at t, and the slot after a last one is the
+reset of the next episode. N-step transitions are put together when they are drawn,
+so that no frame is stored twice and N can change without collecting again.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from flax import struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from apnpql_jax.types import Array, TimeStep, Transition
+
+_CANDIDATES = 4
+"""Starts drawn per row; those where an episode ended (1 in 20 to 94) are refused."""
+
+
+@struct.dataclass
+class Slot:
+  """One instant of one world and what was done there."""
+
+  timestep: TimeStep  # [*b, ...]
+  action: Array  # f32[*b, 7]: action_t; ignored where the step is last
+
+
+@struct.dataclass
+class Replay:
+  """Ring buffer of fixed size; every leaf keeps the dtype of its slot."""
+
+  slots: Slot  # [length, worlds, ...]
+  cursor: Array  # i32[]: time index written next; the oldest one once full
+  size: Array  # i32[]: time steps held, at most length
+
+
+def nbytes(example_slot: Slot, length: int, worlds: int) -> int:
+  """Bytes that ``create`` with the same arguments takes; allocates nothing."""
+  leaves = jax.tree.leaves(example_slot)
+  per_slot = sum(math.prod(x.shape) * np.dtype(x.dtype).itemsize for x in leaves)
+  return length * worlds * per_slot + 2 * np.dtype(np.int32).itemsize
+
+
+def create(example_slot: Slot, length: int, worlds: int) -> Replay:
+  """An empty ring of ``length`` time steps of ``worlds`` worlds each.
+
+  ``example_slot`` is one slot of one world, without batch axes; only its shapes and
+  dtypes are read, so that ShapeDtypeStructs do.
+  """
+  slots = jax.tree.map(
+    lambda x: jnp.zeros((length, worlds, *x.shape), x.dtype), example_slot
+  )
+  # Two arrays, not one twice: a buffer that appears twice cannot be donated.
+  return Replay(slots, cursor=jnp.zeros((), jnp.int32), size=jnp.zeros((), jnp.int32))
+
+
+def add(replay: Replay, chunk: Slot) -> Replay:
+  """Writes a chunk [T, worlds, ...], oldest first, over the oldest time steps.
+
+  It must follow on what was added before. All chunks of one replay must have the same
+  T: as T divides the length, no write then crosses the end of the ring. In place if
+  the replay is donated and, within one jit, sampled only after adding.
+
+  Raises:
+    ValueError: at trace time, if T does not divide the length or if a leaf has
+      another shape or dtype than the ring.
+  """
+  length, steps = replay.slots.action.shape[0], chunk.action.shape[0]
+  if not steps or length % steps:
+    raise ValueError(f"a chunk of {steps} steps does not divide {length} time steps")
+
+  def write(ring: Array, new: Array) -> Array:
+    expected = (steps, *ring.shape[1:])
+    if new.shape != expected or new.dtype != ring.dtype:
+      raise ValueError(
+        f"chunk leaf is {new.dtype}{new.shape}, the ring takes {ring.dtype}{expected}"
+      )
+    return jax.lax.dynamic_update_slice_in_dim(ring, new, replay.cursor, axis=0)
+
+  return Replay(
+    slots=jax.tree.map(write, replay.slots, chunk),
+    cursor=(replay.cursor + steps) % length,
+    size=jnp.minimum(replay.size + steps, length),
+  )
+
+
+def can_sample(replay: Replay, *, n_step: int) -> Array:
+  """bool[]: a slot with ``n_step`` slots after it is held."""
+  return replay.size > n_step
+
+
+def sample(
+  replay: Replay, key: Array, *, batch_size: int, n_step: int, gamma: float
+) -> Transition:
+  """Draws N-step transitions uniformly, with replacement, over all valid starts.
+
+  A start is any slot that is not last and has ``n_step`` slots after it. The reward
+  is sum_{k=1..m} gamma^(k-1) r_{t+k}, where m is the first k with a last step at
+  t+k and N if there is none; the discount is gamma^m, zero if t+m terminated.
+
+  Args:
+    replay: the ring; with one key it gives one batch.
+    key: PRNG key.
+    batch_size: transitions B.
+    n_step: N, at least 1.
+    gamma: discount per control period.
+
+  Returns:
+    Transition [B, ...], weights zero where ``can_sample`` denies the ring and where
+    four candidates per row held fewer than B valid starts.
+  """
+  time, world, valid = _draw_starts(replay, key, batch_size, n_step)
+  length, timestep = replay.slots.action.shape[0], replay.slots.timestep
+  window = (time[:, None] + jnp.arange(1, n_step + 1)[None, :]) % length  # [B, N]
+  flags = (timestep.reward, timestep.terminated, timestep.truncated)
+  reward, terminated, truncated = _gather(flags, window, world[:, None])
+  # m - 1: position of the first end; the last column stands for "none within N".
+  stop = jnp.argmax((terminated | truncated).at[:, -1].set(True), axis=1)
+  counted = jnp.arange(n_step)[None, :] <= stop[:, None]
+  powers = jnp.asarray(np.power(gamma, np.arange(n_step + 1)), reward.dtype)
+  ended = jnp.take_along_axis(terminated, stop[:, None], axis=1)[:, 0]
+  return Transition(
+    observation_tm1=_gather(timestep.observation, time, world),
+    action_tm1=_gather(replay.slots.action, time, world),
+    reward_t=jnp.sum(jnp.where(counted, reward, 0.0) * powers[None, :-1], axis=1),
+    discount_t=jnp.where(ended, 0.0, powers[stop + 1]),
+    observation_t=_gather(timestep.observation, (time + stop + 1) % length, world),
+    primitives_tm1=_gather(timestep.primitives, time, world),
+    weight=valid.astype(reward.dtype),
+  )
+
+
+def expert_count(batch_size: int, expert_share: float) -> int:
+  """Transitions of a batch that come from the expert replay, the same every time."""
+  if not 0.0 <= expert_share <= 1.0:
+    raise ValueError(f"expert_share {expert_share} is not within [0, 1]")
+  return round(batch_size * expert_share)
+
+
+def sample_mixed(
+  agent_replay: Replay,
+  expert_replay: Replay | None,
+  key: Array,
+  *,
+  batch_size: int,
+  expert_share: float,
+  n_step: int,
+  gamma: float,
+) -> Transition:
+  """``sample`` of both replays: agent rows first, then ``expert_count`` expert rows.
+
+  The counts never change: rows of a replay still too small to draw from have weight
+  zero. Filling them from the other would silently change the configured share.
+  Without expert rows the expert replay may be None (ValueError otherwise).
+  """
+  from_expert = expert_count(batch_size, expert_share)
+  if from_expert and expert_replay is None:
+    raise ValueError(f"expert_share {expert_share} needs an expert replay")
+  counts = ((agent_replay, batch_size - from_expert), (expert_replay, from_expert))
+  parts = [
+    sample(replay, part_key, batch_size=count, n_step=n_step, gamma=gamma)
+    for (replay, count), part_key in zip(counts, jax.random.split(key), strict=True)
+    if replay is not None and count
+  ]
+  return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+
+
+def _draw_starts(
+  replay: Replay, key: Array, batch_size: int, n_step: int
+) -> tuple[Array, Array, Array]:
+  """Time index, world and validity, each [B]. Draws candidates, keeps valid ones first.
+
+  Candidates are independent and uniform over the slots with n_step after them, hence
+  those kept are so over the valid ones.
+  """
+  length, worlds = replay.slots.action.shape[:2]
+  key_offset, key_world = jax.random.split(key)
+  shape, span = (_CANDIDATES * batch_size,), jnp.maximum(replay.size - n_step, 1)
+  # Offsets count from the oldest slot, so that no window reaches across the seam.
+  offset = jax.random.randint(key_offset, shape, 0, span)
+  time = (replay.cursor - replay.size + offset) % length
+  world = jax.random.randint(key_world, shape, 0, worlds)
+  step = replay.slots.timestep
+  terminated, truncated = _gather((step.terminated, step.truncated), time, world)
+  valid = ~(terminated | truncated) & can_sample(replay, n_step=n_step)
+  kept = jnp.argsort(~valid, stable=True)[:batch_size]
+  return time[kept], world[kept], valid[kept]
+
+
+def _gather(tree: Any, time: Array, world: Array) -> Any:
+  """Slots at (time, world) of every leaf; the indices are known to be in the ring."""
+  mode = "promise_in_bounds"
+  return jax.tree.map(
+    lambda x: x.at[time, world].get(mode=mode, wrap_negative_indices=False), tree
+  )

@@ -1,0 +1,166 @@
+"""What a run folder holds: its layout, and the record of what the run was made with.
+
+Naming, refusing and replacing folders is the work of ``runs``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+from importlib import metadata
+import json
+import os
+from pathlib import Path
+import platform
+import subprocess
+from typing import Any
+
+from apnpql_jax import runs
+from apnpql_jax.config import TrainConfig, config_to_json
+
+_PACKAGES = (
+  "apnpql-jax jax jaxlib flax optax distrax orbax-checkpoint mujoco mujoco-mjx mink "
+  "numpy"
+).split()
+
+
+@dataclasses.dataclass(frozen=True)
+class RunFolder:
+  """Paths of one run; the folder exists and holds ``config.json``."""
+
+  path: Path
+  """The folder itself."""
+
+  config: TrainConfig
+  """The configuration the run was started with."""
+
+  @property
+  def versions(self) -> Path:
+    """What the run was made with, see ``describe_versions``."""
+    return self.path / "versions.json"
+
+  @property
+  def metrics_csv(self) -> Path:
+    """Metrics as a table."""
+    return self.path / "metrics.csv"
+
+  @property
+  def metrics_jsonl(self) -> Path:
+    """Metrics, one JSON object per line."""
+    return self.path / "metrics.jsonl"
+
+  @property
+  def curve(self) -> Path:
+    """Success rate over steps and time."""
+    return self.path / "curve.png"
+
+  @property
+  def videos(self) -> Path:
+    """Folder of evaluation videos; made by whoever writes the first one."""
+    return self.path / "videos"
+
+
+def create(run_dir: Path, config: TrainConfig, *, overwrite: bool = False) -> RunFolder:
+  """Makes the folder and writes ``config.json`` and ``versions.json`` into it.
+
+  Raises:
+    ConfigError: it holds a run and ``overwrite`` is not set, or something that is no
+      run, which is never removed; or it cannot be made.
+  """
+  runs.check_free(run_dir, overwrite=overwrite)
+  versions = json.dumps(describe_versions(), indent=2) + "\n"
+  with runs.fresh_run_dir(run_dir) as path:
+    folder = RunFolder(path=path, config=config)
+    write_text(folder.versions, versions)
+    # Last, because its presence says that this is a run.
+    write_text(path / runs.CONFIG_FILE, config_to_json(config))
+  return folder
+
+
+def open_run(run_dir: Path) -> RunFolder:
+  """An existing run, to resume or to evaluate.
+
+  Raises:
+    ConfigError: it is not a run folder, or its configuration cannot be read.
+  """
+  return RunFolder(path=run_dir.absolute(), config=runs.load_run_config(run_dir))
+
+
+def changed_versions(folder: RunFolder) -> list[str]:
+  """What differs between the record of a run and now, such as ``jax 0.9.1 -> 0.10.2``.
+
+  A run resumed with other versions or another device learns on, but not bit by bit as
+  it would have; without a readable record, that is the one line.
+  """
+  try:
+    old = _flat(json.loads(folder.versions.read_text(encoding="utf-8")))
+  except (OSError, ValueError):
+    return [f"{folder.versions.name} cannot be read"]
+  new = _flat(describe_versions())
+  names = sorted((old.keys() | new.keys()) - {"created"})
+  return [
+    f"{name.rpartition('.')[2]} {old.get(name)} -> {new.get(name)}"
+    for name in names
+    if old.get(name) != new.get(name)
+  ]
+
+
+def describe_versions() -> dict[str, Any]:
+  """Versions of Python and the packages, git commit of a checkout, device, time."""
+  import jax  # Here, so that naming a run folder does not start JAX.
+
+  devices = jax.devices()
+  return {
+    "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    "python": platform.python_version(),
+    "platform": platform.platform(),
+    "packages": {name: _version(name) for name in _PACKAGES},
+    "git": _git(Path(__file__).parent),
+    "device": {
+      "backend": jax.default_backend(),
+      "kind": devices[0].device_kind,
+      "count": len(devices),
+    },
+  }
+
+
+def write_text(path: Path, text: str) -> None:
+  """Writes a file whole or not at all, so that a killed run leaves no half of one."""
+  part = path.with_name(path.name + ".part")
+  part.write_text(text, encoding="utf-8")
+  os.replace(part, path)
+
+
+def _version(package: str) -> str | None:
+  try:
+    return metadata.version(package)
+  except metadata.PackageNotFoundError:
+    return None
+
+
+def _git(package_dir: Path) -> dict[str, Any] | None:
+  """Commit and whether tracked files differ from it; None outside of a checkout."""
+
+  def git(*args: str) -> str:
+    command = ["git", "-C", str(package_dir), *args]
+    return subprocess.run(
+      command, capture_output=True, text=True, check=True, timeout=10
+    ).stdout.strip()
+
+  try:
+    # An installed package may lie inside somebody else's repository.
+    git("ls-files", "--error-unmatch", "__init__.py")
+    changes = git("status", "--porcelain", "--untracked-files=no")
+    return {"commit": git("rev-parse", "HEAD"), "dirty": bool(changes)}
+  except (OSError, subprocess.SubprocessError):
+    return None
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+  flat: dict[str, Any] = {}
+  for name, value in tree.items():
+    if isinstance(value, dict):
+      flat |= _flat(value, f"{prefix}{name}.")
+    else:
+      flat[prefix + name] = value
+  return flat

@@ -1,0 +1,82 @@
+"""Process-wide settings that must be in place before JAX starts its backend.
+
+Called once by ``import apnpql_jax``. Nothing here imports JAX: the settings go
+through the environment, and through ``jax.config`` where the caller imported JAX
+first. A value the user has set is kept, except for a thread count that can hang.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+import contextlib
+import io
+import os
+from pathlib import Path
+import sys
+
+MIN_THREADS = 4
+"""Smallest XLA:CPU thread pool in which two batched Cholesky calls cannot lock."""
+
+_DEFAULTS = {
+  # On a GPU, XLA multiplies f32 matrices in TF32 (10 bits of mantissa) unless told
+  # otherwise. Mass matrices and forward kinematics then lose three digits, and
+  # contacts with them. No effect on a CPU.
+  "jax_default_matmul_precision": "highest",
+}
+
+
+def configure() -> None:
+  """Sets threads, compilation cache and matmul precision; safe to call again."""
+  _set_threads()
+  defaults = dict(_DEFAULTS, jax_compilation_cache_dir=str(cache_dir() / "xla"))
+  for name, value in defaults.items():
+    os.environ.setdefault(name.upper(), value)
+    jax = sys.modules.get("jax")
+    if jax is not None and getattr(jax.config, name, None) is None:
+      jax.config.update(name, os.environ[name.upper()])
+
+
+def cache_dir() -> Path:
+  """The user's cache folder of this package; made by whoever writes into it."""
+  root = os.environ.get("XDG_CACHE_HOME", "")
+  base = Path(root) if os.path.isabs(root) else Path.home() / ".cache"
+  return base / "apnpql_jax"
+
+
+@contextlib.contextmanager
+def quiet_warp() -> Generator[None, None, None]:
+  """Drops the lines MJX prints when it is imported without the optional Warp.
+
+  They go to standard output and look like errors. Anything else printed inside is
+  passed on.
+  """
+  captured = io.StringIO()
+  try:
+    with contextlib.redirect_stdout(captured):
+      yield
+  finally:
+    for line in captured.getvalue().splitlines():
+      if not line.startswith(("Failed to import warp", "Failed to import mujoco_warp")):
+        print(line)
+
+
+def _set_threads() -> None:
+  # The batched Cholesky of XLA:CPU waits inside a pool thread for other pool
+  # threads. With a pool of two, two such calls wait for each other for ever (seen
+  # from 128 worlds upwards); with four they do not. XLA sizes the pool from these
+  # variables, or from the number of cores.
+  pinned = False
+  for name in ("PJRT_NPROC", "NPROC"):
+    text = os.environ.get(name, "")
+    if text.isdigit():
+      pinned = True
+      if int(text) < MIN_THREADS:
+        os.environ[name] = str(MIN_THREADS)
+  if not pinned and _cores() < MIN_THREADS:
+    os.environ["NPROC"] = str(MIN_THREADS)
+
+
+def _cores() -> int:
+  if hasattr(os, "sched_getaffinity"):  # Not on macOS.
+    return len(os.sched_getaffinity(0))
+  return os.cpu_count() or 1

@@ -1,0 +1,106 @@
+"""Kinematics of the arm in JAX: tool pose and geometric Jacobian."""
+
+from __future__ import annotations
+
+from flax import struct
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from apnpql_jax.sim.scene import Scene
+from apnpql_jax.types import ARM_DOF, Array
+
+
+@struct.dataclass
+class ArmChain:
+  """The serial chain from the world to the tool site, lengths in m."""
+
+  base_pos: Array  # f32[3]: parent of the first link in the world
+  base_mat: Array  # f32[3, 3]
+  link_pos: Array  # f32[6, 3]: joint frame in its parent link at q = 0
+  link_mat: Array  # f32[6, 3, 3]
+  axis: Array  # f32[6, 3]: unit joint axes in the link frame
+  tool_pos: Array  # f32[3]: tool site in the last link
+  tool_mat: Array  # f32[3, 3]
+
+
+def make_chain(scene: Scene) -> ArmChain:
+  """Reads the chain from the compiled model."""
+  model = scene.model
+  data = mujoco.MjData(model)
+  mujoco.mj_kinematics(model, data)
+  bodies = [model.jnt_bodyid[model.dof_jntid[dof]] for dof in scene.arm_dof]
+  base, last = model.body_parentid[bodies[0]], bodies[-1]
+  # The tool site may hang on rigidly attached bodies: take it relative to the last
+  # link at the reference pose.
+  last_mat = data.xmat[last].reshape(3, 3)
+  tool_mat = data.site_xmat[scene.tool_site].reshape(3, 3)
+  arrays = {
+    "base_pos": data.xpos[base],
+    "base_mat": data.xmat[base].reshape(3, 3),
+    "link_pos": model.body_pos[bodies],
+    "link_mat": np.stack([_quat_to_mat(model.body_quat[b]) for b in bodies]),
+    "axis": model.jnt_axis[model.dof_jntid[scene.arm_dof]],
+    "tool_pos": last_mat.T @ (data.site_xpos[scene.tool_site] - data.xpos[last]),
+    "tool_mat": last_mat.T @ tool_mat,
+  }
+  return ArmChain(**{k: jnp.asarray(v, jnp.float32) for k, v in arrays.items()})
+
+
+def forward(chain: ArmChain, q: Array) -> tuple[Array, Array, Array]:
+  """Tool pose and geometric Jacobian in the world frame.
+
+  Args:
+    chain: the arm.
+    q: f32[*b, 6], rad.
+
+  Returns:
+    position f32[*b, 3] in m, rotation f32[*b, 3, 3], and Jacobian f32[*b, 6, 6]
+    (rows: linear m/rad, angular rad/rad).
+  """
+  batch = q.shape[:-1]
+  pos = jnp.broadcast_to(chain.base_pos, (*batch, 3))
+  mat = jnp.broadcast_to(chain.base_mat, (*batch, 3, 3))
+  origins, axes = [], []
+  for i in range(ARM_DOF):
+    pos = pos + mat @ chain.link_pos[i]
+    mat = mat @ chain.link_mat[i]
+    origins.append(pos)
+    axes.append(mat @ chain.axis[i])
+    mat = mat @ _axis_rotation(chain.axis[i], q[..., i])
+  pos = pos + mat @ chain.tool_pos
+  mat = mat @ chain.tool_mat
+  axis, origin = jnp.stack(axes, -1), jnp.stack(origins, -1)
+  linear = jnp.cross(axis, pos[..., None] - origin, axis=-2)
+  return pos, mat, jnp.concatenate([linear, axis], axis=-2)
+
+
+def rotation_error(current: Array, target: Array) -> Array:
+  """Rotation vector f32[*b, 3] (rad, world frame) that turns current into target."""
+  delta = target @ jnp.swapaxes(current, -1, -2)
+  skew = 0.5 * jnp.stack(
+    [
+      delta[..., 2, 1] - delta[..., 1, 2],
+      delta[..., 0, 2] - delta[..., 2, 0],
+      delta[..., 1, 0] - delta[..., 0, 1],
+    ],
+    -1,
+  )
+  sine = jnp.sqrt((skew**2).sum(-1, keepdims=True) + 1e-12)
+  cosine = 0.5 * (jnp.trace(delta, axis1=-2, axis2=-1)[..., None] - 1)
+  return skew * jnp.arctan2(sine, cosine) / sine
+
+
+def _axis_rotation(axis: Array, angle: Array) -> Array:
+  """Rodrigues' formula, f32[*b, 3, 3]."""
+  x, y, z = axis
+  zero = jnp.zeros_like(x)
+  skew = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+  sine, cosine = jnp.sin(angle)[..., None, None], jnp.cos(angle)[..., None, None]
+  return jnp.eye(3) + sine * skew + (1 - cosine) * (skew @ skew)
+
+
+def _quat_to_mat(quat: np.ndarray) -> np.ndarray:
+  mat = np.zeros(9)
+  mujoco.mju_quat2Mat(mat, quat)
+  return mat.reshape(3, 3)

@@ -1,0 +1,81 @@
+"""MJX engine: the reference on GPU and TPU."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from mujoco import mjx
+
+from apnpql_jax.sim import physics
+from apnpql_jax.sim.kinematics import guard_body_tree
+from apnpql_jax.sim.physics import PhysicsState
+from apnpql_jax.sim.scene import Scene
+from apnpql_jax.types import Array
+
+
+class MjxPhysics:
+  """Worlds advanced by ``jax.vmap`` over MJX; see ``physics.Physics``."""
+
+  name = "mjx"
+
+  def __init__(self, scene: Scene, *, substeps: int):
+    """
+    Args:
+      scene: the scene all worlds share.
+      substeps: physics steps per control period.
+    """
+    guard_body_tree()
+    self.scene = scene
+    self._substeps = substeps
+    self._model = mjx.put_model(scene.model, impl="jax")
+    self._template = mjx.make_data(scene.model, impl="jax")
+    self._torque_limit = jnp.asarray(scene.model.actuator_ctrlrange[:6, 1], jnp.float32)
+
+  def step(self, state: PhysicsState, velocity: Array, close: Array) -> PhysicsState:
+    """See ``physics.Physics.step``."""
+    return jax.vmap(self._step_world)(state, velocity, close)
+
+  def _step_world(self, state, velocity, close):
+    data = self._template.replace(
+      qpos=state.qpos,
+      qvel=state.qvel,
+      act=state.act,
+      qacc_warmstart=state.qacc_warmstart,
+      mocap_pos=state.mocap_pos,
+      mocap_quat=state.mocap_quat,
+      time=state.time,
+    )
+
+    def substep(carry, _):
+      return self._substep(carry, velocity, close), None
+
+    data, _ = jax.lax.scan(substep, data, length=self._substeps)
+    return state.replace(
+      qpos=data.qpos,
+      qvel=data.qvel,
+      act=data.act,
+      qacc_warmstart=data.qacc_warmstart,
+      time=data.time,
+    )
+
+  def _substep(self, data, velocity, close):
+    # mjx.step with the control between its velocity and actuation stages, so that
+    # mass matrix and bias are those of the present state and computed only once.
+    model, arm = self._model, self.scene.arm_dof
+    data = mjx.fwd_velocity(model, mjx.fwd_position(model, data))
+    torque = physics.arm_torque(
+      mjx.full_m(model, data)[arm][:, arm],
+      data.qfrc_bias[arm],
+      data.qvel[arm],
+      velocity,
+      self._torque_limit,
+    )
+    finger = physics.gripper_torque(
+      data.qpos[self.scene.gripper_qpos],
+      data.qvel[self.scene.gripper_dof],
+      close,
+      jnp,
+    )
+    data = data.replace(ctrl=jnp.append(torque, finger))
+    data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
+    return mjx.implicit(model, mjx.solve(model, data))

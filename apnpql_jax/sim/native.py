@@ -1,0 +1,103 @@
+"""C MuJoCo engine: a batch of worlds on threads, reached from inside jit.
+
+On a bare CPU it is ten to a hundred times faster than MJX on contact-rich
+scenes. The host callback touches NumPy only: calling JAX from it can deadlock.
+"""
+
+from __future__ import annotations
+
+import functools
+import threading
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from mujoco import batch as mujoco_batch
+import numpy as np
+
+from apnpql_jax.sim import physics
+from apnpql_jax.sim.physics import PhysicsState
+from apnpql_jax.sim.scene import Scene
+from apnpql_jax.types import Array
+
+_STATE_FIELDS = (
+  "qpos",
+  "qvel",
+  "act",
+  "qacc_warmstart",
+  "mocap_pos",
+  "mocap_quat",
+  "time",
+)
+
+
+class NativePhysics:
+  """Worlds advanced by ``mujoco.batch``; see ``physics.Physics``.
+
+  The batch object is scratch space: every call loads the whole state, so the
+  mapping from state to state is pure.
+  """
+
+  name = "native"
+
+  def __init__(self, scene: Scene, *, substeps: int):
+    """
+    Args:
+      scene: the scene all worlds share.
+      substeps: physics steps per control period.
+    """
+    self.scene = scene
+    self._substeps = substeps
+    self._torque_limit = scene.model.actuator_ctrlrange[:6, 1].copy()
+    self._mass_index = _mass_index(scene.model, scene.arm_dof)
+    self._lock = threading.Lock()
+
+  def step(self, state: PhysicsState, velocity: Array, close: Array) -> PhysicsState:
+    """See ``physics.Physics.step``."""
+    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)
+    return jax.pure_callback(self._step_host, shapes, state, velocity, close)
+
+  @functools.lru_cache(maxsize=4)  # noqa: B019 - lives as long as the engine
+  def _batch(self, worlds: int) -> mujoco_batch.Batch:
+    return mujoco_batch.Batch(self.scene.model, nsim=worlds, persistent=True)
+
+  def _step_host(self, state, velocity, close):
+    with self._lock:
+      batch = self._batch(velocity.shape[0])
+      for name in _STATE_FIELDS:
+        getattr(batch, name)[...] = np.asarray(getattr(state, name))
+      self._advance(batch, np.asarray(velocity), np.asarray(close))
+      fields = {
+        name: np.asarray(getattr(batch, name), np.float32) for name in _STATE_FIELDS
+      }
+    return PhysicsState(**fields)
+
+  def _advance(self, batch, velocity, close) -> None:
+    scene, arm = self.scene, self.scene.arm_dof
+    mass, bias = batch.bind("M"), batch.bind("qfrc_bias")
+    qpos, qvel, ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
+    stage = int(mujoco.mjtStage.mjSTAGE_VEL)
+    batch.forward(stage=stage)
+    for _ in range(self._substeps):
+      ctrl[:, :6] = physics.arm_torque(
+        mass[:, self._mass_index],
+        bias[:, arm],
+        qvel[:, arm],
+        velocity,
+        self._torque_limit,
+      )
+      ctrl[:, 6] = physics.gripper_torque(
+        qpos[:, scene.gripper_qpos], qvel[:, scene.gripper_dof], close, np
+      )
+      batch.step(stage=stage)
+
+
+def _mass_index(model: mujoco.MjModel, dofs: np.ndarray) -> np.ndarray:
+  """int[n, n], where the dense block of ``dofs`` lies in the sparse ``data.M``."""
+  index = np.zeros((len(dofs), len(dofs)), np.int64)
+  for row, i in enumerate(dofs):
+    start, count = model.M_rowadr[i], model.M_rownnz[i]
+    columns = list(model.M_colind[start : start + count])
+    for column, j in enumerate(dofs[: row + 1]):
+      index[row, column] = index[column, row] = start + columns.index(j)
+  return index

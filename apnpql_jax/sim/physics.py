@@ -1,0 +1,158 @@
+"""The physics protocol: one state pytree, two engines that advance it.
+
+Both engines compute the same inverse-dynamics control at every substep (paper
+Sec. V-C): a desired acceleration from the velocity error, limited, turned into
+joint torques by the mass matrix and the bias force.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from flax import struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from apnpql_jax.config import BACKENDS, ConfigError
+from apnpql_jax.sim.scene import Scene
+from apnpql_jax.types import Array
+
+MAX_VELOCITY = 1.0
+"""rad/s; the paper's "m/s" can only mean joint space."""
+
+MAX_ACCELERATION = 1.2
+"""rad/s^2 (paper Sec. V-A)."""
+
+VELOCITY_GAIN = 25.0
+"""1/s; brings a joint to the desired velocity well within one 0.15 s period."""
+
+GRIPPER_SPEED = 0.075
+"""m/s of pad gap: the closing speed in the maker's manual."""
+
+GRIPPER_GAIN = 10.0
+"""N m s/rad, half of what one 5 ms step of the coupled fingers can bear."""
+
+GRIPPER_TORQUE = 3.5
+"""N m, as in the maker's model: 30-60 N per pad."""
+
+FINGER_LENGTH = 0.057
+"""m; with FINGER_ANGLE the closed form gap(q) = 2 (4.1 mm + L cos(q + 30 deg))."""
+
+FINGER_ANGLE = np.pi / 6
+
+
+@struct.dataclass
+class PhysicsState:
+  """Everything an engine needs to go on."""
+
+  qpos: Array  # f32[*b, nq]
+  qvel: Array  # f32[*b, nv]
+  act: Array  # f32[*b, na]
+  qacc_warmstart: Array  # f32[*b, nv]
+  mocap_pos: Array  # f32[*b, nmocap, 3]
+  mocap_quat: Array  # f32[*b, nmocap, 4]
+  time: Array  # f32[*b], s since the reset
+
+
+class Physics(Protocol):
+  """An engine for a batch of worlds of one scene."""
+
+  name: str
+  scene: Scene
+
+  def step(self, state: PhysicsState, velocity: Array, close: Array) -> PhysicsState:
+    """Advances every world by one control period.
+
+    Args:
+      state: [worlds, ...].
+      velocity: f32[worlds, 6], desired joint velocities, rad/s.
+      close: f32[worlds], 1 closes the gripper, 0 opens it.
+    """
+    ...
+
+
+def make_physics(name: str, scene: Scene, *, substeps: int) -> Physics:
+  """Engine ``name``; "auto" takes C MuJoCo on a bare CPU and MJX elsewhere.
+
+  Raises:
+    ConfigError: unknown name.
+  """
+  if name not in BACKENDS:
+    raise ConfigError(f"unknown backend '{name}' (valid: {', '.join(BACKENDS)})")
+  if name == "auto":
+    name = "native" if jax.default_backend() == "cpu" else "mjx"
+  if name == "native":
+    from apnpql_jax.sim.native import NativePhysics
+
+    return NativePhysics(scene, substeps=substeps)
+  from apnpql_jax.sim.mjx import MjxPhysics
+
+  return MjxPhysics(scene, substeps=substeps)
+
+
+def initial_state(
+  scene: Scene, qpos: Array, mocap_pos: Array, mocap_quat: Array
+) -> PhysicsState:
+  """A state at rest.
+
+  Args:
+    scene: gives the sizes.
+    qpos: f32[*b, nq].
+    mocap_pos: f32[*b, nmocap, 3].
+    mocap_quat: f32[*b, nmocap, 4].
+  """
+  batch = qpos.shape[:-1]
+  model = scene.model
+  return PhysicsState(
+    qpos=qpos,
+    qvel=jnp.zeros((*batch, model.nv)),
+    act=jnp.zeros((*batch, model.na)),
+    qacc_warmstart=jnp.zeros((*batch, model.nv)),
+    mocap_pos=mocap_pos,
+    mocap_quat=mocap_quat,
+    time=jnp.zeros(batch),
+  )
+
+
+def arm_torque(mass: Any, bias: Any, qvel: Any, desired: Any, limit: Any) -> Any:
+  """Inverse-dynamics torque of the arm; NumPy or JAX arrays.
+
+  tau = M clip(gain (v* - v), +-a_max) + bias, clipped to the joint's limit.
+
+  Args:
+    mass: [*b, 6, 6] arm block of the joint-space mass matrix, kg m^2.
+    bias: [*b, 6] Coriolis, centrifugal and gravity torque, N m.
+    qvel: [*b, 6] joint velocities, rad/s.
+    desired: [*b, 6] desired joint velocities, rad/s.
+    limit: [6] torque limits, N m.
+
+  Returns:
+    [*b, 6] torques, N m.
+  """
+  desired = desired.clip(-MAX_VELOCITY, MAX_VELOCITY)
+  acceleration = (VELOCITY_GAIN * (desired - qvel)).clip(
+    -MAX_ACCELERATION, MAX_ACCELERATION
+  )
+  return ((mass * acceleration[..., None, :]).sum(-1) + bias).clip(-limit, limit)
+
+
+def gripper_torque(angle: Any, velocity: Any, close: Any, xp: Any) -> Any:
+  """Torque of the driven finger: fixed speed of the pad gap, bounded squeeze.
+
+  An explicit servo in place of a MuJoCo velocity actuator, whose saturated force
+  C MuJoCo and MJX integrate differently.
+
+  Args:
+    angle: [*b] driven finger joint, rad, 0 = open.
+    velocity: [*b] its velocity, rad/s.
+    close: [*b] in {0, 1}.
+    xp: ``numpy`` or ``jax.numpy``.
+
+  Returns:
+    [*b] N m, positive closes.
+  """
+  slope = 2 * FINGER_LENGTH * xp.sin(angle.clip(0.0, 1.1) + FINGER_ANGLE)
+  desired = (2 * close - 1) * GRIPPER_SPEED / slope
+  torque = GRIPPER_GAIN * (desired - velocity)
+  return torque.clip(-GRIPPER_TORQUE, GRIPPER_TORQUE)

@@ -1,0 +1,159 @@
+"""Pushing plate: drag a rimmed plate onto the goal mark from inside its rim.
+
+Primitives, so that following one of them never knocks the plate over:
+
+- object: go above the plate; once aligned, descend until the closed finger tips
+  are inside the rim; from inside, move to the plate's centre.
+- goal: from inside the rim, move by what the plate still lacks to the goal, so the
+  plate is dragged along, the slower the less deep the tool is; from elsewhere, go
+  above the goal.
+- neutral: the configuration of the keyframe.
+
+A tool that is low but outside the plate rises first. While dragging, the target is a
+waypoint at most ``LOOKAHEAD`` ahead, because a straight line in joint space bends
+away from one on the table by L^2 / 8r (1.2 mm for 0.07 m at 0.5 m).
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from apnpql_jax.presets import mjcf_path
+from apnpql_jax.sim import arm
+from apnpql_jax.sim.kinematics import Kinematics
+from apnpql_jax.sim.physics import PhysicsState
+from apnpql_jax.sim.scene import load_scene
+from apnpql_jax.tasks.task import register, ResetDraw
+from apnpql_jax.types import Array
+
+WORKSPACE = ((0.36, 0.58), (-0.24, 0.24))
+"""m; x and y ranges of plate and goal, within reach of a vertical tool."""
+
+MIN_DISTANCE = 0.12
+"""m between plate and goal: four times the goal's tolerance."""
+
+ARM_NOISE = 0.15
+"""rad; uniform spread of the initial joint angles around the neutral ones."""
+
+GOAL_TOLERANCE = 0.03
+"""m; the mark's radius exceeds the plate's by this much: solved = inside the mark."""
+
+REST_SPEED = 0.05
+"""m/s; slower than this the plate stops within 0.7 mm (v^2 / 2 mu g, mu = 0.2)."""
+
+HOVER_HEIGHT = 0.07
+"""m; tool height at which the finger tips clear the rim (24 mm) and the camera too."""
+
+CLEAR = 0.035
+"""m; above this the tool may travel without touching the rim."""
+
+DRAG_HEIGHT = 0.010
+"""m; 4 mm above the plate's floor, the tips' sides against the rim."""
+
+LOW = 0.022
+"""m; below this the finger tips are behind the rim."""
+
+INSIDE = 0.083
+"""m; radius of the rim's centre line: a low tool closer than this is inside."""
+
+ALIGNED = 0.03
+"""m; a descent from here keeps 25 mm between tips and rim."""
+
+LOOKAHEAD = 0.07
+"""m; longest step of a dragging tool's waypoint."""
+
+
+@register("push_plate")
+class PushPlate:
+  """See the module's docstring; implements ``tasks.task.Task``."""
+
+  name = "push_plate"
+
+  def __init__(self):
+    self.scene = load_scene(mjcf_path("push_plate"), cameras=("global", "wrist"))
+    self._plate, self._plate_dof = self.scene.free_joint("plate")
+    self._goal = self.scene.mocap("goal")
+    self._neutral_qpos = self.scene.keyframe("neutral")
+    chain = arm.make_chain(self.scene)
+    neutral = jnp.asarray(self._neutral_qpos[self.scene.arm_qpos], jnp.float32)
+    self._neutral_pos, self._neutral_mat, _ = arm.forward(chain, neutral)
+
+  def sample_resets(self, rng: np.random.Generator, count: int) -> ResetDraw:
+    """See ``Task.sample_resets``."""
+    low, high = np.array(WORKSPACE).T
+    plate, goal = rng.uniform(low, high, (2, count, 2))
+    while (near := np.linalg.norm(plate - goal, axis=-1) < MIN_DISTANCE).any():
+      goal[near] = rng.uniform(low, high, (int(near.sum()), 2))
+    qpos = np.tile(self._neutral_qpos, (count, 1))
+    qpos[:, self.scene.arm_qpos] += rng.uniform(-ARM_NOISE, ARM_NOISE, (count, 6))
+    qpos[:, self._plate : self._plate + 2] = plate
+    yaw = rng.uniform(-np.pi, np.pi, count)
+    qpos[:, self._plate + 3] = np.cos(yaw / 2)
+    qpos[:, self._plate + 6] = np.sin(yaw / 2)
+    mocap_pos = np.zeros((count, self.scene.model.nmocap, 3))
+    mocap_pos[:, self._goal, :2] = goal
+    mocap_quat = np.zeros((count, self.scene.model.nmocap, 4))
+    mocap_quat[..., 0] = 1
+    return qpos, mocap_pos, mocap_quat
+
+  def tool_targets(
+    self, state: PhysicsState, kinematics: Kinematics
+  ) -> tuple[Array, Array]:
+    """See ``Task.tool_targets``."""
+    tool = kinematics.site_xpos[:, self.scene.tool_site]
+    plate, goal = self._plate_xy(state), self._goal_xy(state)
+    inside = self._inside(tool, plate)[:, None]
+    above = (tool[:, 2] > CLEAR)[:, None]
+    aligned = (_norm(tool[:, :2] - plate) < ALIGNED)[:, None]
+
+    def waypoint(xy, height):
+      return jnp.concatenate([xy, jnp.full_like(xy[:, :1], height)], -1)
+
+    rise = waypoint(tool[:, :2], HOVER_HEIGHT)
+    over_plate = jnp.where(above, waypoint(plate, HOVER_HEIGHT), rise)
+    to_object = jnp.where(inside | aligned, waypoint(plate, DRAG_HEIGHT), over_plate)
+    depth = ((LOW - tool[:, 2]) / (LOW - DRAG_HEIGHT)).clip(0.0, 1.0)
+    drag = goal - plate
+    reach = depth * LOOKAHEAD / jnp.maximum(_norm(drag), LOOKAHEAD)
+    drag = drag * reach[:, None]
+    over_goal = jnp.where(above, waypoint(goal, HOVER_HEIGHT), rise)
+    to_goal = jnp.where(inside, waypoint(tool[:, :2] + drag, DRAG_HEIGHT), over_goal)
+    neutral = jnp.broadcast_to(self._neutral_pos, to_goal.shape)
+    positions = jnp.stack([to_object, to_goal, neutral], axis=1)
+    return positions, jnp.broadcast_to(self._neutral_mat, (*positions.shape, 3))
+
+  def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:
+    """The plate's centre is within 3 cm of the goal's, flat on the table, at rest."""
+    del kinematics
+    distance = _norm(self._plate_xy(state) - self._goal_xy(state))
+    speed = _norm(state.qvel[:, self._plate_dof : self._plate_dof + 3])
+    on_table = state.qpos[:, self._plate + 2] < 0.01
+    return (distance < GOAL_TOLERANCE) & (speed < REST_SPEED) & on_table
+
+  def objects(self, state: PhysicsState) -> Array:
+    """f32[worlds, 6]: xyz of plate and goal, m."""
+    plate = state.qpos[:, self._plate : self._plate + 3]
+    return jnp.concatenate([plate, state.mocap_pos[:, self._goal]], -1)
+
+  def expert(
+    self, state: PhysicsState, kinematics: Kinematics, primitives: Array
+  ) -> Array:
+    """Reach into the plate, then drag; the fingers stay closed."""
+    tool = kinematics.site_xpos[:, self.scene.tool_site]
+    inside = self._inside(tool, self._plate_xy(state))[:, None]
+    velocity = jnp.where(inside, primitives[:, 1], primitives[:, 0])
+    return jnp.concatenate([velocity, jnp.ones_like(velocity[:, :1])], -1)
+
+  def _plate_xy(self, state: PhysicsState) -> Array:
+    return state.qpos[:, self._plate : self._plate + 2]
+
+  def _goal_xy(self, state: PhysicsState) -> Array:
+    return state.mocap_pos[:, self._goal, :2]
+
+  def _inside(self, tool: Array, plate: Array) -> Array:
+    return (tool[:, 2] < LOW) & (_norm(tool[:, :2] - plate) < INSIDE)
+
+
+def _norm(x: Array) -> Array:
+  return jnp.sqrt((x**2).sum(-1) + 1e-12)

@@ -1,0 +1,95 @@
+"""What a task is: a scene, resets, success, tool targets and a scripted expert.
+
+A task is one Python file, one MJCF file and one preset. Everything here is
+batched over worlds on the first axis; positions are in m in the world frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import importlib
+import pkgutil
+from typing import Protocol
+
+import numpy as np
+
+from apnpql_jax.config import ConfigError
+from apnpql_jax.sim.kinematics import Kinematics
+from apnpql_jax.sim.physics import PhysicsState
+from apnpql_jax.sim.scene import Scene
+from apnpql_jax.types import Array
+
+ResetDraw = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""qpos f64[n, nq], mocap_pos f64[n, nmocap, 3], mocap_quat f64[n, nmocap, 4]."""
+
+
+class Task(Protocol):
+  """The four tasks of the paper (Sec. V-A) and any other are this."""
+
+  name: str
+  scene: Scene
+
+  def sample_resets(self, rng: np.random.Generator, count: int) -> ResetDraw:
+    """Draws initial states uniformly within the task's ranges, without overlaps."""
+    ...
+
+  def tool_targets(
+    self, state: PhysicsState, kinematics: Kinematics
+  ) -> tuple[Array, Array]:
+    """Where each action primitive wants the tool now.
+
+    Returns:
+      positions f32[worlds, 3, 3] and rotations f32[worlds, 3, 3, 3]; rows are
+      target object, desired goal and neutral configuration.
+    """
+    ...
+
+  def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:
+    """bool[worlds]: the task is solved; rewarded once with +1."""
+    ...
+
+  def objects(self, state: PhysicsState) -> Array:
+    """f32[worlds, n]: privileged poses of objects and goals for --obs state."""
+    ...
+
+  def expert(
+    self, state: PhysicsState, kinematics: Kinematics, primitives: Array
+  ) -> Array:
+    """f32[worlds, 7]: the scripted policy, a feedback on the privileged state."""
+    ...
+
+
+_REGISTRY: dict[str, Callable[[], Task]] = {}
+
+
+def register(name: str) -> Callable:
+  """Class decorator that makes a task known under ``name``."""
+
+  def decorate(factory: Callable[[], Task]) -> Callable[[], Task]:
+    _REGISTRY[name] = factory
+    return factory
+
+  return decorate
+
+
+def task_names() -> list[str]:
+  """Names of all registered tasks, sorted."""
+  _import_all()
+  return sorted(_REGISTRY)
+
+
+def make_task(name: str) -> Task:
+  """Builds the task ``name``.
+
+  Raises:
+    ConfigError: unknown name; the message lists the valid ones.
+  """
+  if name not in task_names():
+    raise ConfigError(f"unknown task '{name}' (valid: {', '.join(task_names())})")
+  return _REGISTRY[name]()
+
+
+def _import_all() -> None:
+  package = importlib.import_module("apnpql_jax.tasks")
+  for module in pkgutil.iter_modules(package.__path__):
+    importlib.import_module(f"apnpql_jax.tasks.{module.name}")

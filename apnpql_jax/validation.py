@@ -1,0 +1,174 @@
+"""What a configuration must satisfy, checked before anything is built.
+
+Knows no task and no algorithm: their valid names are handed in, so that reading a
+configuration never imports the simulator or the learner.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import math
+from typing import TYPE_CHECKING
+
+from apnpql_jax import codec
+from apnpql_jax.codec import ConfigError
+
+if TYPE_CHECKING:
+  from apnpql_jax.config import AgentConfig, TrainConfig
+
+BACKENDS = ("auto", "mjx", "native")
+OBSERVATIONS = ("pixels", "state")
+
+_PIXEL_BYTES = 3 * (72 * 96 + 36 * 64)
+_OTHER_BYTES = 4 * (21 + 7 + 18 + 1) + 2
+"""Robot state, action, primitive labels, reward (f32) and the two end flags."""
+
+_POSITIVE = (
+  "env.worlds env.time_limit_s env.control_period_s env.bank_rows "
+  "agent.n_step agent.learning_rate_e agent.learning_rate_m "
+  "agent.learning_rate_alpha agent.learning_rate_nu agent.epsilon "
+  "agent.feature_dim agent.max_grad_norm agent.patch_channels agent.conv_channels "
+  "agent.ap_delta agent.min_std agent.initial_alpha agent.min_alpha "
+  "replay.capacity replay.batch_size total_steps rollout_length "
+  "updates_per_iteration eval_every eval_episodes checkpoint_every keep_checkpoints"
+).split()
+_NOT_NEGATIVE = (
+  "agent.lambda_ap replay.expert_steps replay.expert_noise seed"
+).split()
+
+
+def validate(
+  config: TrainConfig,
+  *,
+  tasks: Sequence[str] | None = None,
+  algorithms: Sequence[str] | None = None,
+  memory_bytes: int | None = None,
+) -> None:
+  """Refuses a configuration that cannot work, before anything is built.
+
+  Args:
+    config: what to check.
+    tasks: valid task names; not checked if None.
+    algorithms: valid algorithm names; not checked if None.
+    memory_bytes: memory the replays must fit into; not checked if None.
+
+  Raises:
+    ConfigError: one line that names the setting and the valid choices or the fix.
+  """
+  _validate_ranges(config)
+  check_name("env.backend", config.env.backend, BACKENDS)
+  check_name("env.obs", config.env.obs, OBSERVATIONS)
+  if tasks is not None:
+    check_name("env.task", config.env.task, tasks)
+  if algorithms is not None:
+    check_name("agent.algorithm", config.agent.algorithm, algorithms)
+  _validate_agent(config.agent)
+  _validate_replay(config, memory_bytes)
+
+
+def check_name(field: str, value: str, valid: Sequence[str]) -> None:
+  """Raises ConfigError naming the valid choices unless ``value`` is one of them."""
+  if value not in valid:
+    raise ConfigError(f"unknown {field} {value!r}; choose from {', '.join(valid)}")
+
+
+def replay_bytes(config: TrainConfig) -> int:
+  """Bytes the agent and expert replays take at most (object poses not counted)."""
+  slot = _OTHER_BYTES + (_PIXEL_BYTES if config.env.obs == "pixels" else 0)
+  return slot * (config.replay.capacity + config.replay.expert_steps)
+
+
+def _validate_ranges(config: TrainConfig) -> None:
+  values = dict(codec.flatten(config))
+  for name, value in values.items():
+    if isinstance(value, float) and not math.isfinite(value):
+      raise ConfigError(f"{name}={value} is not a finite number")
+    if isinstance(value, int) and value >= 2**31:
+      raise ConfigError(f"{name}={value} must be below 2**31")
+  for name in _POSITIVE:
+    if values[name] <= 0:
+      raise ConfigError(f"{name}={values[name]} must be positive")
+  for name in _NOT_NEGATIVE:
+    if values[name] < 0:
+      raise ConfigError(f"{name}={values[name]} must not be negative")
+  if config.env.episode_steps < 1:
+    raise ConfigError(
+      f"env.time_limit_s={config.env.time_limit_s} is shorter than one control "
+      f"period; use at least {config.env.control_period_s}"
+    )
+
+
+def _validate_agent(agent: AgentConfig) -> None:
+  for name in ("gamma", "target_rate"):
+    if not 0.0 < getattr(agent, name) <= 1.0:
+      raise ConfigError(f"agent.{name}={getattr(agent, name)} must be within (0, 1]")
+  for name in ("target_samples", "policy_samples", "num_atoms"):
+    if getattr(agent, name) < 2:
+      raise ConfigError(f"agent.{name}={getattr(agent, name)} must be at least 2")
+  if agent.v_min >= agent.v_max:
+    raise ConfigError(
+      f"agent.v_min={agent.v_min} must be below agent.v_max={agent.v_max}"
+    )
+  if not agent.hidden or min(agent.hidden) < 1 or max(agent.hidden) >= 2**31:
+    raise ConfigError(f"agent.hidden={agent.hidden} must be positive layer widths")
+  if not agent.min_std < agent.initial_std < agent.max_std:
+    raise ConfigError(
+      f"agent.initial_std={agent.initial_std} must lie between agent.min_std="
+      f"{agent.min_std} and agent.max_std={agent.max_std}"
+    )
+  if not agent.v_min < agent.initial_value < agent.v_max:
+    raise ConfigError(
+      f"agent.initial_value={agent.initial_value} must lie between agent.v_min="
+      f"{agent.v_min} and agent.v_max={agent.v_max}"
+    )
+  samples = min(agent.target_samples, agent.policy_samples)
+  # The KL of a distribution over S samples from their uniform weights is at most
+  # log S: a larger limit never binds, and the temperature would run to zero.
+  if agent.epsilon >= math.log(samples):
+    raise ConfigError(
+      f"agent.epsilon={agent.epsilon} can never bind: it must be below log({samples})"
+      f" = {math.log(samples):.3f}; lower it, or raise agent.target_samples and "
+      "agent.policy_samples"
+    )
+
+
+def _validate_replay(config: TrainConfig, memory_bytes: int | None) -> None:
+  replay, per_iteration = config.replay, config.env.worlds * config.rollout_length
+  if not 0.0 <= replay.expert_share <= 1.0:
+    raise ConfigError(
+      f"replay.expert_share={replay.expert_share} must be within [0, 1]"
+    )
+  expert = replay.batch_size * replay.expert_share
+  if abs(expert - round(expert)) > 1e-6:
+    raise ConfigError(
+      f"replay.batch_size={replay.batch_size} times replay.expert_share="
+      f"{replay.expert_share} is not whole; use expert_share="
+      f"{round(expert) / replay.batch_size:.6g}"
+    )
+  if replay.expert_steps % config.env.worlds:
+    raise ConfigError(
+      f"replay.expert_steps={replay.expert_steps} must be a multiple of env.worlds="
+      f"{config.env.worlds}"
+    )
+  if expert and not replay.expert_steps:
+    raise ConfigError(
+      "replay.expert_steps=0 leaves nothing to draw; use replay.expert_share=0"
+    )
+  if replay.capacity % per_iteration:
+    raise ConfigError(
+      f"replay.capacity={replay.capacity} must be a multiple of env.worlds * "
+      f"rollout_length = {per_iteration}; use "
+      f"{max(1, round(replay.capacity / per_iteration)) * per_iteration}"
+    )
+  if replay.capacity // config.env.worlds <= config.agent.n_step + 1:
+    raise ConfigError(
+      f"replay.capacity={replay.capacity} holds no {config.agent.n_step}-step "
+      f"transition; use at least {(config.agent.n_step + 2) * config.env.worlds}"
+    )
+  need = replay_bytes(config)
+  if memory_bytes is not None and need > memory_bytes:
+    raise ConfigError(
+      f"the replays need {need / 2**30:.1f} GiB but this machine has "
+      f"{memory_bytes / 2**30:.1f} GiB; lower replay.capacity or "
+      "replay.expert_steps"
+    )

@@ -1,0 +1,200 @@
+"""Configurations: what is refused, and that JSON gives back what it was given."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import json
+import math
+
+from hypothesis import given, settings, strategies as st
+import pytest
+
+from apnpql_jax import config as config_module, presets
+from apnpql_jax.config import (
+  AgentConfig,
+  ConfigError,
+  EnvConfig,
+  ReplayConfig,
+  TrainConfig,
+  config_diff,
+  config_from_json,
+  config_to_json,
+  format_diff,
+  replay_bytes,
+  validate,
+)
+
+POSITIVE = st.floats(1e-6, 1e6, allow_nan=False)
+
+
+def changed(path: str, value: object) -> TrainConfig:
+  """The default configuration with one dotted field replaced."""
+  return replaced(TrainConfig(), path.split("."), value)
+
+
+def replaced(config, names, value):
+  if len(names) > 1:
+    value = replaced(getattr(config, names[0]), names[1:], value)
+  return dataclasses.replace(config, **{names[0]: value})
+
+
+def edited(path: str, value: object) -> str:
+  """The default configuration as JSON with one dotted key set, or removed by ``...``"""
+  data = json.loads(config_to_json(TrainConfig()))
+  *parents, last = path.split(".")
+  node = data
+  for name in parents:
+    node = node[name]
+  if value is ...:
+    del node[last]
+  else:
+    node[last] = value
+  return json.dumps(data)
+
+
+def test_defaults_and_presets_are_valid():
+  validate(TrainConfig())
+  for name in presets.preset_names():
+    validate(presets.load_preset(name))
+
+
+def test_every_field_has_a_docstring():
+  tree = ast.parse(inspect.getsource(config_module))
+  classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
+  fields = 0
+  for cls in classes:
+    for node, after in zip(cls.body, [*cls.body[1:], None], strict=True):
+      if isinstance(node, ast.AnnAssign):
+        fields += 1
+        assert isinstance(after, ast.Expr), f"{cls.name}.{ast.unparse(node.target)}"
+        assert isinstance(after.value, ast.Constant)
+  expected = (EnvConfig, AgentConfig, ReplayConfig, TrainConfig)
+  assert fields == sum(len(dataclasses.fields(cls)) for cls in expected)
+
+
+@pytest.mark.parametrize(
+  ("path", "value", "words"),
+  [
+    ("env.backend", "bullet", ["auto", "mjx", "native"]),
+    ("env.obs", "depth", ["pixels", "state"]),
+    ("env.task", "juggle", ["push_plate", "stack_box"]),
+    ("agent.algorithm", "ppo", ["ap_npql", "sac"]),
+    ("agent.epsilon", math.log(100), ["4.605", "policy_samples"]),
+    ("agent.epsilon", float("nan"), ["finite"]),
+    ("agent.epsilon", 0.0, ["positive"]),
+    ("agent.gamma", 1.5, ["(0, 1]"]),
+    ("agent.v_min", 1.0, ["agent.v_max"]),
+    ("agent.hidden", (), ["agent.hidden"]),
+    ("agent.target_samples", 1, ["at least 2"]),
+    ("agent.learning_rate_e", float("inf"), ["finite"]),
+    ("replay.expert_share", 0.3, ["replay.batch_size", "0.296875"]),
+    ("replay.expert_share", 1.5, ["[0, 1]"]),
+    ("replay.expert_steps", 0, ["expert_share=0"]),
+    ("replay.expert_noise", -0.1, ["negative"]),
+    ("replay.capacity", 51_201, ["256", "use 51200"]),
+    ("replay.capacity", 2**31, ["2**31"]),
+    ("rollout_length", 7, ["224", "replay.capacity"]),
+    ("total_steps", 0, ["positive"]),
+    ("seed", -1, ["negative"]),
+    ("seed", 2**31, ["2**31"]),
+    ("env.time_limit_s", 0.1, ["0.15"]),
+  ],
+)
+def test_refusals_name_the_setting_and_the_fix(path, value, words):
+  with pytest.raises(ConfigError) as error:
+    validate(
+      changed(path, value),
+      tasks=["push_plate", "stack_box"],
+      algorithms=["ap_npql", "sac"],
+    )
+  message = str(error.value)
+  assert "\n" not in message
+  for word in [path, *words]:
+    assert word in message
+
+
+def test_epsilon_just_below_the_log_of_the_samples_is_accepted():
+  validate(changed("agent.epsilon", math.log(100) - 1e-6))
+
+
+def test_replay_that_holds_no_transition_is_refused():
+  config = TrainConfig(replay=ReplayConfig(capacity=128), rollout_length=1)
+  with pytest.raises(ConfigError, match="use at least 160"):
+    validate(config)
+  validate(changed("replay.capacity", 256))
+
+
+def test_replay_larger_than_memory_is_refused():
+  need = replay_bytes(TrainConfig())
+  validate(TrainConfig(), memory_bytes=need)
+  with pytest.raises(ConfigError, match="GiB.*replay.capacity"):
+    validate(TrainConfig(), memory_bytes=need - 1)
+  # Two images of three bytes a pixel, in every slot of both replays.
+  slots = 51_200 + 64 * 94
+  assert need > slots * 3 * (72 * 96 + 36 * 64)
+  assert replay_bytes(changed("env.obs", "state")) < need / 100
+
+
+def test_episode_steps_of_the_paper():
+  assert EnvConfig().episode_steps == 93
+  assert EnvConfig(time_limit_s=1.5, control_period_s=0.15).episode_steps == 10
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+  epsilon=st.floats(1e-3, 4.6),
+  rate=POSITIVE,
+  hidden=st.lists(st.integers(1, 2048), min_size=1, max_size=4),
+  seed=st.integers(0, 2**31 - 1),
+  video=st.booleans(),
+)
+def test_json_round_trip_is_exact(epsilon, rate, hidden, seed, video):
+  agent = AgentConfig(epsilon=epsilon, learning_rate_e=rate, hidden=tuple(hidden))
+  config = TrainConfig(agent=agent, seed=seed, video=video)
+  assert config_from_json(config_to_json(config)) == config
+
+
+def test_whole_numbers_are_read_as_floats():
+  config = config_from_json(edited("agent.epsilon", 1))
+  assert type(config.agent.epsilon) is float
+
+
+@pytest.mark.parametrize(
+  ("text", "words"),
+  [
+    ("", ["JSON"]),
+    ("[]", ["object"]),
+    ("__import__('os')", ["JSON"]),
+    ("[" * 100_000, ["JSON"]),
+    (edited("seed", ...), ["'seed'", "missing"]),
+    (edited("agent.gamma", ...), ["'agent.gamma'", "missing"]),
+    (edited("agent.gama", 0.9), ["'agent.gama'", "gamma"]),
+    (edited("agent", 3), ["agent", "object"]),
+    (edited("seed", "0"), ["'seed'", "int", "str"]),
+    (edited("seed", 1.0), ["'seed'", "int", "float"]),
+    (edited("seed", True), ["'seed'", "int", "bool"]),
+    (edited("video", 1), ["'video'", "bool"]),
+    (edited("agent.gamma", None), ["'agent.gamma'", "float"]),
+    (edited("agent.gamma", 10**400), ["'agent.gamma'"]),
+    (edited("agent.hidden", 256), ["'agent.hidden'", "list"]),
+    (edited("agent.hidden", [256, "256"]), ["'agent.hidden'", "int"]),
+    (edited("agent.gamma", float("nan")), ["NaN"]),
+    (edited("agent.gamma", 2.0), ["agent.gamma", "(0, 1]"]),
+  ],
+)
+def test_json_is_read_strictly(text, words):
+  with pytest.raises(ConfigError) as error:
+    config_from_json(text)
+  for word in words:
+    assert word in str(error.value)
+
+
+def test_diff_names_exactly_what_differs():
+  a = TrainConfig()
+  b = replaced(changed("agent.gamma", 0.9), ["seed"], 5)
+  assert config_diff(a, b) == {"agent.gamma": (0.99, 0.9), "seed": (0, 5)}
+  assert config_diff(b, a) == {"agent.gamma": (0.9, 0.99), "seed": (5, 0)}
+  assert config_diff(a, TrainConfig()) == {}
+  assert format_diff(config_diff(a, b)) == "agent.gamma 0.99 -> 0.9, seed 0 -> 5"

@@ -1,0 +1,228 @@
+"""Metric files, the curve, the interval and the progress display."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from pathlib import Path
+import pty
+import sys
+
+from hypothesis import given, settings, strategies as st
+import imageio.v3 as iio
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from apnpql_jax import metrics
+from apnpql_jax.config import ConfigError
+from apnpql_jax.extra_sinks import make_sinks
+from apnpql_jax.progress import TrainProgress
+
+
+class Clock:
+  """A clock that a test moves by hand."""
+
+  def __init__(self):
+    self.now = 1000.0
+
+  def __call__(self) -> float:
+    return self.now
+
+
+def _csv(folder: Path) -> list[dict[str, str]]:
+  with (folder / "metrics.csv").open(newline="") as file:
+    return list(csv.DictReader(file))
+
+
+def _jsonl(folder: Path) -> list[dict[str, float]]:
+  lines = (folder / "metrics.jsonl").read_text().splitlines()
+  return [json.loads(line) for line in lines]
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.integers(1, 2000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
+def test_wilson_interval_equals_scipy(pair: tuple[int, int]):
+  successes, n = pair
+  expected = stats.binomtest(successes, n).proportion_ci(method="wilson")
+  low, high = metrics.wilson_interval(successes, n)
+  np.testing.assert_allclose((low, high), expected, rtol=1e-9, atol=1e-12)
+  assert 0.0 <= low <= successes / n <= high <= 1.0
+
+
+def test_wilson_interval_at_its_ends():
+  assert metrics.wilson_interval(0, 0) == (0.0, 1.0)
+  expected = stats.binomtest(7, 9).proportion_ci(0.8, method="wilson")
+  got = metrics.wilson_interval(7, 9, confidence=0.8)
+  np.testing.assert_allclose(got, expected, rtol=1e-9)
+  for successes, n in ((-1, 5), (6, 5)):
+    with pytest.raises(ValueError, match="successes of 5 episodes"):
+      metrics.wilson_interval(successes, n)
+
+
+def test_rows_are_on_disk_at_once_in_both_files(tmp_path: Path):
+  clock = Clock()
+  writer = metrics.MetricWriter(tmp_path, clock=clock)
+  clock.now += 2.5
+  values = {"loss": jnp.float32(0.25), "updates": np.int64(2**53), "flag": True}
+  writer.write(64, values)
+  row = {"step": 64, "time/wall_s": 2.5, "loss": 0.25, "updates": 2**53, "flag": 1}
+  assert _jsonl(tmp_path) == [row]
+  assert _csv(tmp_path) == [{name: str(value) for name, value in row.items()}]
+  with pytest.raises((TypeError, ValueError)):
+    writer.write(65, {"vector": np.zeros(2)})
+  assert len(_jsonl(tmp_path)) == len(_csv(tmp_path)) == 1
+
+
+def test_new_metrics_add_columns_and_keep_old_rows(tmp_path: Path):
+  with metrics.MetricWriter(tmp_path) as writer:
+    writer.write(1, {"a": 1.0})
+    writer.write(2, {"b": 2.0, 'odd, "name"': 5})
+    writer.write(3, {"a": 3.0, "b": 4.0})
+    writer.write(4, {"b": float("nan"), "c": float("inf")})
+  table = _csv(tmp_path)
+  names = ["step", "time/wall_s", "a", "b", 'odd, "name"', "c"]
+  assert all(list(row) == names for row in table)
+  assert [row["a"] for row in table] == ["1.0", "", "3.0", ""]
+  assert [row["b"] for row in table][:3] == ["", "2.0", "4.0"]
+  # Strict JSON: no NaN token, which most readers refuse.
+  assert _jsonl(tmp_path)[3]["b"] is None and _jsonl(tmp_path)[3]["c"] is None
+  assert [path.name for path in tmp_path.iterdir() if path.suffix == ".part"] == []
+
+
+def test_a_resumed_run_appends_and_its_clock_goes_on(tmp_path: Path):
+  clock = Clock()
+  with metrics.MetricWriter(tmp_path, clock=clock) as writer:
+    for step in (10, 20, 30):
+      clock.now += 5
+      writer.write(step, {"a": float(step)})
+  with (tmp_path / "metrics.jsonl").open("a") as file:
+    file.write('{"step": 40, "a": 4')  # Killed in the middle of a line.
+  clock.now += 1000
+  with metrics.MetricWriter(tmp_path, resume_step=20, clock=clock) as writer:
+    clock.now += 3
+    writer.write(25, {"b": 1.0})
+  assert [row["step"] for row in _jsonl(tmp_path)] == [10, 20, 25]
+  assert [row["time/wall_s"] for row in _jsonl(tmp_path)] == [5.0, 10.0, 13.0]
+  assert [row["step"] for row in _csv(tmp_path)] == ["10", "20", "25"]
+  assert [row["a"] for row in _csv(tmp_path)] == ["10.0", "20.0", ""]
+
+
+def test_a_damaged_record_is_refused(tmp_path: Path):
+  path = tmp_path / "metrics.jsonl"
+  for text in ("oops\n", '{"a": 1}\n', "[1]\n", '{"step": "x"}\n'):
+    path.write_text('{"step": 1}\n' + text)
+    with pytest.raises(ConfigError, match=r"metrics.jsonl, line 2: not a row"):
+      metrics.MetricWriter(tmp_path)
+    assert path.read_text().endswith(text)
+
+
+def test_more_sinks_get_the_same_numbers(tmp_path: Path):
+  class Memory:
+    def __init__(self):
+      self.rows, self.closed = [], False
+
+    def write(self, step, row):
+      self.rows.append((step, dict(row)))
+
+    def close(self):
+      self.closed = True
+
+  sink = Memory()
+  with metrics.MetricWriter(tmp_path, sinks=[sink]) as writer:
+    writer.write(3, {"a": jnp.float32(0.5)})
+    assert not sink.closed
+  assert sink.rows == [(3, {"a": 0.5})] and sink.closed
+
+
+def test_extras_that_are_unknown_or_missing_are_named(
+  tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+  with pytest.raises(ConfigError, match="choose from tensorboard, wandb"):
+    make_sinks(["tensorflow"], tmp_path, {})
+  for name, package, extra in (
+    ("tensorboard", "tensorboardX", "tb"),
+    ("wandb", "wandb", "wandb"),
+  ):
+    monkeypatch.setitem(sys.modules, package, None)  # As if it were not installed.
+    with pytest.raises(ConfigError, match=rf"{package} .*apnpql-jax\[{extra}\]"):
+      make_sinks([name], tmp_path, {})
+  assert make_sinks([], tmp_path, {}) == []
+
+
+def test_curve_shows_where_the_success_rate_is(tmp_path: Path):
+  path = tmp_path / "curve.png"
+  train_only: list[metrics.Row] = [{"step": 1, "loss": 2.0}]
+  assert not metrics.plot_curve(train_only, path) and not path.exists()
+
+  def drawn(rates: list[float]) -> np.ndarray:
+    rows: list[metrics.Row] = [
+      {"step": i, "time/wall_s": 60.0 * i, metrics.SUCCESS: r, metrics.EPISODES: 200}
+      for i, r in enumerate(rates)
+    ]
+    assert metrics.plot_curve([*train_only, *rows], path, title="push_plate")
+    return iio.imread(path)[..., :3].astype(int)
+
+  high, low = drawn([0.9, 0.9, 0.9]), drawn([0.1, 0.1, 0.1])
+  assert high.shape == low.shape and high.shape[0] > 200
+  # Blue ink, the curve and its band, lies in the upper half or in the lower one.
+  heights = []
+  for image in (high, low):
+    ink = (image[..., 2] - image[..., 0]) > 60
+    left, right = np.split(ink, [ink.shape[1] // 2], axis=1)
+    assert left.any() and right.any()
+    heights.append(np.nonzero(ink)[0].mean() / ink.shape[0])
+  assert heights[0] < 0.35 and heights[1] > 0.6
+  assert not list(tmp_path.glob("*.part"))
+
+
+def test_the_curve_band_is_the_wilson_interval():
+  row: metrics.Row = {"step": 1, metrics.SUCCESS: 0.85, metrics.EPISODES: 40}
+  expected = stats.binomtest(34, 40).proportion_ci(method="wilson")
+  np.testing.assert_allclose(metrics._interval(row), expected, rtol=1e-9)
+  assert metrics._interval({"step": 1, metrics.SUCCESS: 0.85}) == (0.85, 0.85)
+
+
+def test_progress_prints_plain_lines_where_there_is_no_terminal(capsys):
+  clock, stream = Clock(), io.StringIO()
+  with TrainProgress(1000, stream=stream, period_s=10, clock=clock) as progress:
+    progress.update(100, updates=7)  # 100 s of compilation lie before this.
+    for i in range(1, 6):
+      clock.now += 4.0
+      progress.update(100 + 80 * i, updates=7 + 40 * i, success_rate=0.25)
+      progress.update(100 + 80 * i, updates=7 + 40 * i)
+    progress.message("checkpoint [1] written")
+  lines = stream.getvalue().splitlines()
+  assert lines[0] == "step 100 of 1,000 (10 %)  success --"
+  # 80 steps and 40 updates every 4 s; at 340, 660 steps are left.
+  figures = "success 25 %  20 steps/s  10.0 updates/s  0:00:33 left"
+  assert lines[1] == f"step 340 of 1,000 (34 %)  {figures}"
+  assert lines[2] == "checkpoint [1] written"
+  assert lines[3].startswith("step 500 of 1,000 (50 %)") and len(lines) == 4
+  assert capsys.readouterr() == ("", "")
+
+
+def test_progress_draws_a_bar_on_a_terminal():
+  controller, terminal = pty.openpty()
+  clock = Clock()
+  with os.fdopen(terminal, "w", encoding="utf-8") as stream:
+    with TrainProgress(1000, stream=stream, clock=clock) as progress:
+      progress.update(0, updates=0)
+      clock.now += 10.0
+      progress.update(500, updates=100, success_rate=0.5)
+      progress.message("a [bracketed] note")
+    stream.flush()
+    shown = os.read(controller, 2**16).decode()
+  os.close(controller)
+  assert "50%" in shown and "500 steps" in shown and "success 50 %" in shown
+  assert "a [bracketed] note" in shown and "\x1b[" in shown
+
+
+def test_progress_writes_to_standard_error_only(capsys):
+  with TrainProgress(10) as progress:
+    progress.update(5, updates=1)
+  out, err = capsys.readouterr()
+  assert out == "" and "step 5 of 10" in err

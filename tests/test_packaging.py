@@ -1,0 +1,135 @@
+"""The wheel and the lock files: what a user who installs the project gets."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+
+from hatchling.builders.wheel import WheelBuilder
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+import pytest
+
+from apnpql_jax import presets
+from apnpql_jax.config import ConfigError
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+  """The wheel, built as an installer builds it, without the network."""
+  folder = tmp_path_factory.mktemp("wheel")
+  return Path(next(WheelBuilder(str(ROOT)).build(directory=str(folder))))
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory) -> Path:
+  """The wheel unpacked, as an installer leaves it."""
+  folder = tmp_path_factory.mktemp("site")
+  with zipfile.ZipFile(wheel) as archive:
+    archive.extractall(folder)
+  return folder
+
+
+def python(site: Path, cwd: Path, *args: str) -> str:
+  """Standard output of Python in ``cwd`` with ``site`` before everything installed."""
+  done = subprocess.run(
+    [sys.executable, *args],
+    cwd=cwd,
+    env=dict(os.environ, PYTHONPATH=str(site)),
+    capture_output=True,
+    text=True,
+    check=False,
+  )
+  assert done.returncode == 0, done.stderr
+  return done.stdout
+
+
+def locked(name: str) -> dict[str, str]:
+  """Normalised name -> version of a lock file."""
+  pairs = [line.split("==") for line in (ROOT / name).read_text().splitlines()]
+  return {canonicalize_name(package): version for package, version in pairs}
+
+
+def test_wheel_holds_scenes_presets_and_the_whole_package(wheel):
+  with zipfile.ZipFile(wheel) as archive:
+    names = set(archive.namelist())
+  expected = {str(x.relative_to(ROOT)) for x in ROOT.glob("apnpql_jax/**/*.py")}
+  for folder, pattern in (("mjcf", "*.xml"), ("experiments", "*.py")):
+    found = {
+      f"apnpql_jax/{x.relative_to(ROOT)}" for x in ROOT.glob(f"{folder}/{pattern}")
+    }
+    assert found
+    expected |= found
+  assert expected <= names
+  tops = {name.split("/")[0] for name in names}
+  assert tops == {"apnpql_jax", next(x for x in tops if x.endswith(".dist-info"))}
+  assert not any("/results/" in name or name.endswith(".pyc") for name in names)
+
+
+def test_wheel_works_from_another_directory(installed, tmp_path):
+  code = (
+    "import apnpql_jax; from apnpql_jax import presets; print(apnpql_jax.__file__);"
+    "print(presets.mjcf_path('push_plate')); presets.load_preset('push_plate')"
+  )
+  for line in python(installed, tmp_path, "-c", code).splitlines():
+    assert Path(line).is_relative_to(installed)
+  out = python(installed, tmp_path, "-m", "apnpql_jax", "list", "--json")
+  assert '"presets": ["push_plate"' in out
+
+
+def test_scenes_in_the_wheel_compile(installed, tmp_path):
+  code = (
+    "import mujoco; from apnpql_jax import presets;"
+    "path = presets.mjcf_path('push_plate');"
+    "print(mujoco.MjModel.from_xml_path(str(path)).ncam)"
+  )
+  assert int(python(installed, tmp_path, "-c", code)) >= 2
+
+
+def test_command_is_declared(installed):
+  (entry,) = installed.glob("*.dist-info/entry_points.txt")
+  assert "apnpql = apnpql_jax.cli:main" in entry.read_text()
+
+
+@pytest.mark.parametrize("name", ["requirements.lock", "requirements-dev.lock"])
+def test_lock_is_plain_names_and_versions(name):
+  for line in (ROOT / name).read_text().splitlines():
+    assert re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.]+", line), line
+
+
+@pytest.mark.parametrize(
+  ("lock", "wanted"),
+  [
+    ("requirements.lock", PROJECT["dependencies"]),
+    ("requirements-dev.lock", PROJECT["optional-dependencies"]["test"]),
+  ],
+)
+def test_lock_satisfies_what_the_project_asks_for(lock, wanted):
+  versions = locked("requirements.lock") | locked(lock)
+  for requirement in map(Requirement, wanted):
+    version = versions[canonicalize_name(requirement.name)]
+    assert requirement.specifier.contains(version, prereleases=True), requirement
+
+
+def test_mujoco_and_mjx_are_a_matched_pair():
+  versions = locked("requirements.lock")
+  assert versions["mujoco"] == versions["mujoco-mjx"]
+
+
+@pytest.mark.parametrize(
+  "name",
+  ["", "..", "../cli", "push_plate/../push_plate", "/etc/passwd", "push_plate\n"],
+)
+def test_names_cannot_leave_their_folder(name):
+  with pytest.raises(ConfigError, match="push_plate"):
+    presets.load_preset(name)
+  with pytest.raises(ConfigError, match="push_plate"):
+    presets.mjcf_path(name)

@@ -1,0 +1,113 @@
+"""Run folders: nothing is lost unless it was asked for."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from apnpql_jax import runs
+from apnpql_jax.config import AgentConfig, ConfigError, TrainConfig, config_to_json
+
+
+def write_run(folder: Path, config: TrainConfig | None = None) -> Path:
+  folder.mkdir(parents=True)
+  (folder / "config.json").write_text(config_to_json(config or TrainConfig()))
+  (folder / "curve.png").write_bytes(b"old")
+  return folder
+
+
+def test_new_run_dir_takes_the_first_free_number(tmp_path):
+  assert runs.new_run_dir("push_plate", tmp_path) == tmp_path / "push_plate-1"
+  (tmp_path / "push_plate-1").mkdir()
+  (tmp_path / "push_plate-3").mkdir()
+  assert runs.new_run_dir("push_plate", tmp_path) == tmp_path / "push_plate-2"
+
+
+def test_configuration_of_a_run_is_read_back(tmp_path):
+  config = TrainConfig(seed=3, agent=AgentConfig(gamma=0.9))
+  assert runs.load_run_config(write_run(tmp_path / "a", config)) == config
+
+
+def test_configuration_that_is_not_text_is_refused(tmp_path):
+  write_run(tmp_path / "a")
+  (tmp_path / "a" / "config.json").write_bytes(b"\xff\xfe\x00")
+  with pytest.raises(ConfigError, match="config.json"):
+    runs.load_run_config(tmp_path / "a")
+
+
+def test_resume_may_change_only_what_does_not_alter_learning(tmp_path):
+  run = write_run(tmp_path / "a")
+  for name in runs.MAY_CHANGE:
+    value = getattr(TrainConfig(), name)
+    other = not value if isinstance(value, bool) else value + 1
+    runs.check_resumable(run, dataclasses.replace(TrainConfig(), **{name: other}))
+  fixed = {f.name for f in dataclasses.fields(TrainConfig)} - set(runs.MAY_CHANGE)
+  for name in fixed - {"env", "agent", "replay"}:
+    changed = {name: getattr(TrainConfig(), name) + 1}
+    with pytest.raises(ConfigError, match=name):
+      runs.check_resumable(run, dataclasses.replace(TrainConfig(), **changed))
+
+
+def test_only_a_run_can_be_overwritten(tmp_path):
+  runs.check_free(tmp_path / "new", overwrite=False)
+  (tmp_path / "empty").mkdir()
+  runs.check_free(tmp_path / "empty", overwrite=False)
+  run = write_run(tmp_path / "run")
+  runs.check_free(run, overwrite=True)
+  with pytest.raises(ConfigError, match="--overwrite"):
+    runs.check_free(run, overwrite=False)
+  (tmp_path / "link").symlink_to(run, target_is_directory=True)
+  (run / "config.json").rename(tmp_path / "elsewhere.json")
+  for folder in (run, tmp_path, tmp_path / "link", tmp_path / "elsewhere.json"):
+    with pytest.raises(ConfigError):
+      runs.check_free(folder, overwrite=True)
+
+
+def test_fresh_folder_replaces_the_old_run(tmp_path):
+  run = write_run(tmp_path / "run")
+  with runs.fresh_run_dir(run) as folder:
+    assert folder == run
+    assert list(folder.iterdir()) == []
+    (folder / "config.json").write_text("new")
+  assert [path.name for path in tmp_path.iterdir()] == ["run"]
+  assert [path.name for path in run.iterdir()] == ["config.json"]
+
+
+@pytest.mark.parametrize("existed", [False, True])
+@pytest.mark.parametrize(
+  ("error", "begun"), [(ConfigError, False), (ConfigError, True), (RuntimeError, False)]
+)
+def test_refused_run_leaves_everything_as_it_was(tmp_path, error, begun, existed):
+  run = tmp_path / "run"
+  if existed:
+    write_run(run)
+  with pytest.raises(error), runs.fresh_run_dir(run) as folder:
+    (folder / "scene.bin").write_bytes(b"new")
+    if begun:
+      (folder / "config.json").write_text("new")
+    raise error("no such camera")
+  assert [path.name for path in tmp_path.iterdir()] == (["run"] if existed else [])
+  if existed:
+    assert (run / "curve.png").read_bytes() == b"old"
+    assert not (run / "scene.bin").exists()
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, SystemExit, RuntimeError])
+def test_stopped_run_is_kept_and_the_old_one_removed(tmp_path, stop):
+  run = write_run(tmp_path / "run")
+  with pytest.raises(stop), runs.fresh_run_dir(run) as folder:
+    (folder / "config.json").write_text("new")
+    raise stop()
+  assert [path.name for path in tmp_path.iterdir()] == ["run"]
+  assert (run / "config.json").read_text() == "new"
+
+
+def test_folder_that_cannot_be_made_is_refused(tmp_path):
+  (tmp_path / "file").write_text("")
+  with (
+    pytest.raises(ConfigError, match="cannot make run folder"),
+    runs.fresh_run_dir(tmp_path / "file" / "run"),
+  ):
+    pass

@@ -1,0 +1,105 @@
+"""Process settings: what ``import apnpql_jax`` leaves in a fresh process."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+
+from apnpql_jax import runtime
+
+ROOT = Path(__file__).resolve().parents[1]
+NAMES = (
+  "NPROC",
+  "PJRT_NPROC",
+  "JAX_COMPILATION_CACHE_DIR",
+  "JAX_DEFAULT_MATMUL_PRECISION",
+)
+
+
+def run(code: str, **env: str) -> str:
+  """Standard output of ``code`` in a process with none of the settings but ``env``."""
+  base = {k: v for k, v in os.environ.items() if k not in NAMES}
+  done = subprocess.run(
+    [sys.executable, "-c", code],
+    env=base | {"PYTHONPATH": str(ROOT)} | env,
+    capture_output=True,
+    text=True,
+    check=True,
+  )
+  return done.stdout
+
+
+def settings(before: str = "", **env: str) -> dict[str, str]:
+  """Environment after ``import apnpql_jax`` in a process of its own."""
+  report = "import apnpql_jax; print(json.dumps(dict(os.environ)))"
+  return json.loads(run(f"import json, os\n{before}\n{report}", **env))
+
+
+def threads(env: dict[str, str], cores: int) -> int:
+  """Size of the pool XLA makes: the first variable set, else one per core."""
+  return int(env.get("PJRT_NPROC") or env.get("NPROC") or cores)
+
+
+@pytest.mark.parametrize(
+  ("given", "least"),
+  [
+    ({}, 4),
+    ({"NPROC": "2"}, 4),
+    ({"PJRT_NPROC": "1"}, 4),
+    ({"NPROC": "1", "PJRT_NPROC": "2"}, 4),
+    ({"NPROC": "8"}, 8),
+  ],
+)
+def test_pool_has_at_least_four_threads(given, least):
+  one_core = "os.sched_setaffinity(0, {0}) if hasattr(os, 'sched_setaffinity') else 0"
+  assert threads(settings(one_core, **given), cores=1) >= least
+
+
+def test_what_the_user_sets_is_kept(tmp_path):
+  given = {
+    "JAX_COMPILATION_CACHE_DIR": str(tmp_path),
+    "JAX_DEFAULT_MATMUL_PRECISION": "float32",
+    "NPROC": "6",
+  }
+  env = settings(**given)
+  assert {name: env[name] for name in given} == given
+
+
+def test_cache_lies_in_the_cache_folder_of_the_user(tmp_path):
+  env = settings(XDG_CACHE_HOME=str(tmp_path))
+  assert env["JAX_COMPILATION_CACHE_DIR"] == str(tmp_path / "apnpql_jax" / "xla")
+  env = settings(XDG_CACHE_HOME="relative", HOME=str(tmp_path))
+  expected = tmp_path / ".cache" / "apnpql_jax" / "xla"
+  assert env["JAX_COMPILATION_CACHE_DIR"] == str(expected)
+
+
+@pytest.mark.parametrize(
+  "order", ["import apnpql_jax, jax", "import jax, apnpql_jax"], ids=["first", "after"]
+)
+def test_jax_takes_the_settings_whichever_is_imported_first(order, tmp_path):
+  code = (
+    f"{order}; c = jax.config;"
+    "print(c.jax_compilation_cache_dir, c.jax_default_matmul_precision)"
+  )
+  cache = tmp_path / "apnpql_jax" / "xla"
+  assert run(code, XDG_CACHE_HOME=str(tmp_path)).split() == [str(cache), "highest"]
+
+
+def test_quiet_warp_drops_its_two_lines_only(capsys):
+  with runtime.quiet_warp():
+    print("Failed to import warp: No module named 'warp'")
+    print("something else")
+    print("Failed to import mujoco_warp: No module named 'warp'")
+  assert capsys.readouterr().out == "something else\n"
+
+
+def test_quiet_warp_lets_errors_through(capsys):
+  with pytest.raises(ImportError), runtime.quiet_warp():
+    print("a hint")
+    raise ImportError
+  assert capsys.readouterr().out == "a hint\n"
