@@ -104,7 +104,7 @@ class AgentConfig:
   epsilon_nu: float = 0.0
   """Entropy floor of the prior in nats."""
 
-  lambda_ap: float = 1.0
+  lambda_ap: float = 10.0
   """Weight of the behaviour-cloning loss of the action primitives."""
 
   feature_dim: int = 256
@@ -133,6 +133,10 @@ class AgentConfig:
 
   max_std: float = 0.5
   """Limit of the prior's Cholesky entries, rad/s; the action box ends at 1."""
+
+  min_prob: float = 0.05
+  """Smallest weight of a component and probability of a gripper command in the prior,
+  so that it never stops proposing one."""
 
   initial_alpha: float = 0.1
   """Temperature before training, in units of return."""

@@ -161,10 +161,12 @@ class Env:
     joints = state.qpos[:, jnp.append(scene.arm_qpos, scene.gripper_qpos)]
     stacked = jnp.concatenate([history[:, 7:], joints], axis=-1)
     robot = _where(fresh, jnp.tile(joints, (1, HISTORY)), stacked)
+    tool = kinematics.site_xpos[:, scene.tool_site]
+    seen = Observation(robot=robot, tool=tool)
     if self.config.obs == "state":
-      return Observation(robot=robot, objects=self.task.objects(state))
+      return seen.replace(objects=self.task.objects(state))
     overview, wrist = (camera(kinematics) for camera in self._cameras)
-    return Observation(robot=robot, global_image=overview, wrist_image=wrist)
+    return seen.replace(global_image=overview, wrist_image=wrist)
 
 
 def make_env(config: EnvConfig) -> Env:

@@ -28,10 +28,11 @@ NUM_PRIMITIVES = 3
 class Observation:
   """What the agent sees (paper Sec. V-A). Absent modalities are ``None``."""
 
-  robot: Array  # f32[*b, 21]: last three (6 joint angles, gripper angle), newest last, rad
+  robot: Array  # f32[*b, 21]: last three (6 joint, gripper angle), newest last, rad
+  tool: Array | None = None  # f32[*b, 3]: tool position by forward kinematics, m
   global_image: Array | None = None  # u8[*b, 72, 96, 3]
   wrist_image: Array | None = None  # u8[*b, 36, 64, 3]
-  objects: Array | None = None  # f32[*b, n]: privileged poses, only under --obs state
+  objects: Array | None = None  # f32[*b, n]: positions, m, only under --obs state
 
 
 @struct.dataclass
@@ -42,7 +43,7 @@ class TimeStep:
   reward: Array  # f32[*b]: received on arriving here
   terminated: Array  # bool[*b]: arrived by success; do not bootstrap
   truncated: Array  # bool[*b]: arrived by time-out; bootstrap
-  primitives: Array  # f32[*b, 3, 6]: privileged action primitives, rad/s, labels only
+  primitives: Array  # f32[*b, 3, 6]: privileged labels of the primitives, rad/s
 
   @property
   def last(self) -> Array:

@@ -116,6 +116,8 @@ def _validate_agent(agent: AgentConfig) -> None:
       f"agent.initial_std={agent.initial_std} must lie between agent.min_std="
       f"{agent.min_std} and agent.max_std={agent.max_std}"
     )
+  if not 0.0 < agent.min_prob < 1.0 / 3.0:
+    raise ConfigError(f"agent.min_prob={agent.min_prob} must be within (0, 1/3)")
   if not agent.v_min < agent.initial_value < agent.v_max:
     raise ConfigError(
       f"agent.initial_value={agent.initial_value} must lie between agent.v_min="

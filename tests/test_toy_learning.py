@@ -1,205 +1,174 @@
 """AP-NPQL learns a manipulation task without physics within a minute.
 
 A point in R^6 with a gripper must go to an object, close there, and carry it to a
-goal: reward +1 once, 15 steps. Its action primitives are the paper's: towards the
-object, the goal, and a neutral place. A quarter of each batch is an expert's.
+goal: reward +1 once, at most 15 steps. Its action primitives are the paper's: towards
+the object, the goal and a neutral place. A quarter of each batch is an expert's.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+import functools
 
 from flax import struct
 import jax
 import jax.numpy as jnp
 
+from apnpql_jax import replay
 from apnpql_jax.agents.learner import LearnerState, make_agent
 from apnpql_jax.config import AgentConfig
-from apnpql_jax.types import Observation, Transition
+from apnpql_jax.types import Array, Observation, TimeStep
 
 WORLDS = 32
 LIMIT = 15
-RADIUS = 0.35
+RADIUS = 0.5
 STEP = 0.4
-GAMMA = 0.95
-CAPACITY = 16_384
 CONFIG = AgentConfig(
-  hidden=(64, 64),
-  feature_dim=64,
+  gamma=0.95,
+  hidden=(128, 128),
+  feature_dim=128,
   target_samples=40,
   policy_samples=40,
   learning_rate_e=1e-3,
-  learning_rate_m=1e-3,
-  learning_rate_alpha=1e-3,
-  learning_rate_nu=1e-3,
-  epsilon=1.5,
-  epsilon_nu=-3.0,
+  epsilon=2.0,
+  lambda_ap=5.0,
 )
-
-
-class World(NamedTuple):
-  point: jax.Array  # f32[W, 6]
-  history: jax.Array  # f32[W, 3, 7]
-  places: jax.Array  # f32[W, 3, 6]: object, goal, neutral
-  holding: jax.Array  # bool[W]
-  time: jax.Array  # i32[W]
-
-
-@struct.dataclass
-class Buffer:
-  rows: Transition  # [CAPACITY, ...]
-  cursor: jax.Array
-
-
-def reset(key: jax.Array) -> World:
-  key_point, key_places = jax.random.split(key)
-  point = jax.random.uniform(key_point, (WORLDS, 6), minval=-0.5, maxval=0.5)
-  places = jax.random.uniform(key_places, (WORLDS, 3, 6), minval=-1.0)
-  places = places.at[:, 2].set(0.0)
-  history = jnp.concatenate([point, jnp.zeros((WORLDS, 1))], axis=-1)
-  return World(
-    point,
-    jnp.repeat(history[:, None], 3, axis=1),
-    places,
-    jnp.zeros(WORLDS, bool),
-    jnp.zeros(WORLDS, jnp.int32),
-  )
-
-
-def observe(world: World) -> Observation:
-  places = world.places[:, :2].reshape(WORLDS, -1)
-  holding = world.holding.astype(jnp.float32)[:, None]
-  return Observation(
-    robot=world.history.reshape(WORLDS, -1),
-    objects=jnp.concatenate([places, holding], axis=-1),
-  )
-
-
-def primitives(world: World) -> jax.Array:
-  velocity = (world.places - world.point[:, None]) / STEP
-  size = jnp.max(jnp.abs(velocity), axis=-1, keepdims=True)
-  return velocity / jnp.maximum(size, 1.0)
-
-
-def step(world: World, action: jax.Array) -> tuple[World, jax.Array]:
-  """Grasps, then moves the point; True where the object, held, is at the goal."""
-  closed = action[:, 6] > 0.5
-  holding = closed & (world.holding | near(world, 0))
-  point = world.point + STEP * action[:, :6]
-  newest = jnp.concatenate([point, closed[:, None].astype(jnp.float32)], axis=-1)
-  history = jnp.concatenate([world.history[:, 1:], newest[:, None]], axis=1)
-  moved = World(point, history, world.places, holding, world.time + 1)
-  return moved, holding & near(moved, 1)
-
-
-def near(world: World, place: int) -> jax.Array:
-  """True where the point is within reach of the place."""
-  return jnp.linalg.norm(world.point - world.places[:, place], axis=-1) < RADIUS
-
-
-def expert(world: World, key: jax.Array) -> jax.Array:
-  """Follows one primitive after the other, with noise."""
-  close = world.holding | near(world, 0)
-  velocity = jnp.where(
-    close[:, None], primitives(world)[:, 1], primitives(world)[:, 0]
-  )
-  velocity = velocity + 0.1 * jax.random.normal(key, velocity.shape)
-  velocity = jnp.clip(velocity, -1.0, 1.0)
-  return jnp.concatenate([velocity, close[:, None].astype(jnp.float32)], axis=-1)
-
-
-def where(mask: jax.Array, a: World, b: World) -> World:
-  def choose(x: jax.Array, y: jax.Array) -> jax.Array:
-    return jnp.where(mask.reshape((-1,) + (1,) * (x.ndim - 1)), x, y)
-
-  return jax.tree.map(choose, a, b)
-
-
 AGENT = make_agent(CONFIG)
 
 
-def agent_policy(state: LearnerState):
-  def policy(world: World, key: jax.Array) -> jax.Array:
-    return AGENT.act(state.params, observe(world), key, False)[0]
+@struct.dataclass
+class World:
+  history: Array  # f32[W, 3, 7]: last positions and gripper, newest last
+  places: Array  # f32[W, 3, 6]: object, goal, neutral
+  holding: Array  # bool[W]
+  success: Array  # bool[W]
+  time: Array  # i32[W]
+
+  @property
+  def point(self) -> Array:
+    return self.history[:, -1, :6]
+
+  def near(self, place: int) -> Array:
+    """True where the point is within reach of the place."""
+    return jnp.linalg.norm(self.point - self.places[:, place], axis=-1) < RADIUS
+
+  @property
+  def timestep(self) -> TimeStep:
+    velocity = (self.places - self.point[:, None]) / STEP
+    size = jnp.max(jnp.abs(velocity), axis=-1, keepdims=True)
+    objects = (self.places[:, :2].reshape(WORLDS, -1), self.holding[:, None])
+    return TimeStep(
+      observation=Observation(
+        robot=self.history.reshape(WORLDS, -1),
+        objects=jnp.concatenate([x.astype(jnp.float32) for x in objects], axis=-1),
+      ),
+      reward=self.success.astype(jnp.float32),
+      terminated=self.success,
+      truncated=(self.time >= LIMIT) & ~self.success,
+      primitives=velocity / jnp.maximum(size, 1.0),
+    )
+
+
+Policy = Callable[[World, Array], Array]
+
+
+def reset(key: Array) -> World:
+  key_point, key_places = jax.random.split(key)
+  start = jax.random.uniform(key_point, (WORLDS, 1, 6), minval=-0.5, maxval=0.5)
+  places = jax.random.uniform(key_places, (WORLDS, 3, 6), minval=-1.0)
+  return World(
+    history=jnp.pad(jnp.repeat(start, 3, axis=1), ((0, 0), (0, 0), (0, 1))),
+    places=places.at[:, 2].set(0.0),
+    holding=jnp.zeros(WORLDS, bool),
+    success=jnp.zeros(WORLDS, bool),
+    time=jnp.zeros(WORLDS, jnp.int32),
+  )
+
+
+def step(world: World, action: Array, key: Array) -> World:
+  """Grasps, then moves the point. Where the episode had ended, a new one begins."""
+  holding = (action[:, 6] > 0.5) & (world.holding | world.near(0))
+  newest = jnp.concatenate([world.point + STEP * action[:, :6], action[:, 6:]], -1)
+  moved = world.replace(
+    history=jnp.concatenate([world.history[:, 1:], newest[:, None]], axis=1),
+    holding=holding,
+    time=world.time + 1,
+  )
+  moved = moved.replace(success=holding & moved.near(1))
+  last = world.timestep.last
+  return jax.tree.map(
+    lambda new, old: jnp.where(last.reshape((-1,) + (1,) * (new.ndim - 1)), new, old),
+    reset(key),
+    moved,
+  )
+
+
+def expert(world: World, key: Array) -> Array:
+  """Follows one primitive after the other, with noise."""
+  close = world.holding | world.near(0)
+  towards = world.timestep.primitives
+  velocity = jnp.where(close[:, None], towards[:, 1], towards[:, 0])
+  velocity = velocity + 0.1 * jax.random.normal(key, velocity.shape)
+  return jnp.concatenate(
+    [jnp.clip(velocity, -1.0, 1.0), close[:, None].astype(jnp.float32)], axis=-1
+  )
+
+
+def agent(state: LearnerState, *, greedy: bool) -> Policy:
+  def policy(world: World, key: Array) -> Array:
+    return AGENT.act(state.params, world.timestep.observation, key, greedy)[0]
 
   return policy
 
 
-def play(policy, world: World, key: jax.Array) -> tuple[World, Transition]:
-  """One step of every world, with autoreset."""
-  key_act, key_reset = jax.random.split(key)
-  action = policy(world, key_act)
-  moved, success = step(world, action)
-  transition = Transition(
-    observation_tm1=observe(world),
-    action_tm1=action,
-    reward_t=success.astype(jnp.float32),
-    discount_t=GAMMA * (1.0 - success.astype(jnp.float32)),
-    observation_t=observe(moved),
-    primitives_tm1=primitives(world),
-    weight=jnp.ones(WORLDS),
-  )
-  done = success | (moved.time >= LIMIT)
-  return where(done, reset(key_reset), moved), transition
+def rollout(
+  policy: Policy, world: World, key: Array, length: int
+) -> tuple[World, replay.Slot]:
+  def body(world: World, key: Array) -> tuple[World, replay.Slot]:
+    key_act, key_step = jax.random.split(key)
+    action = policy(world, key_act)
+    return step(world, action, key_step), replay.Slot(world.timestep, action)
+
+  return jax.lax.scan(body, world, jax.random.split(key, length))
 
 
-def rollout(policy, world: World, key: jax.Array, length: int):
-  """Plays ``length`` steps; rows [length * WORLDS, ...]."""
-
-  def body(world: World, key: jax.Array):
-    return play(policy, world, key)
-
-  world, rows = jax.lax.scan(body, world, jax.random.split(key, length))
-  return world, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
-
-
-def draw(rows: Transition, held: jax.Array, num: int, key: jax.Array) -> Transition:
-  chosen = jax.random.randint(key, (num,), 0, held)
-  return jax.tree.map(lambda x: x[chosen], rows)
-
-
-def train_step(carry, key: jax.Array):
-  """Two control steps of all worlds, then four updates on uniform batches."""
-  state, world, buffer, demos = carry
-  key_play, key_learn = jax.random.split(key)
-  world, new = rollout(agent_policy(state), world, key_play, 2)
-  at = buffer.cursor % CAPACITY
-  rows = jax.tree.map(
-    lambda old, x: jax.lax.dynamic_update_slice_in_dim(old, x, at, axis=0),
-    buffer.rows,
-    new,
-  )
-  buffer = Buffer(rows, buffer.cursor + 2 * WORLDS)
-
-  def learn(state: LearnerState, key: jax.Array):
-    keys = jax.random.split(key, 3)
-    own = draw(buffer.rows, jnp.minimum(buffer.cursor, CAPACITY), 48, keys[0])
-    shown = draw(demos, demos.weight.size, 16, keys[1])
-    batch = jax.tree.map(lambda *x: jnp.concatenate(x), own, shown)
-    return AGENT.update(state, batch, keys[2])
-
-  state, metrics = jax.lax.scan(learn, state, jax.random.split(key_learn, 4))
-  return (state, world, buffer, demos), jax.tree.map(lambda x: x[-1], metrics)
-
-
-def success_rate(policy, key: jax.Array) -> jax.Array:
-  """Share of the worlds solved in one episode each."""
+def success_rate(policy: Policy, key: Array) -> Array:
+  """Share of the worlds solved in their first episode."""
   key_reset, key_play = jax.random.split(key)
-
-  def body(carry, key: jax.Array):
-    world, solved = carry
-    world, success = step(world, policy(world, key))
-    return (world, solved | success), None
-
-  start = (reset(key_reset), jnp.zeros(WORLDS, bool))
-  keys = jax.random.split(key_play, LIMIT)
-  return jnp.mean(jax.lax.scan(body, start, keys)[0][1])
+  _, slots = rollout(policy, reset(key_reset), key_play, LIMIT + 1)
+  return jnp.mean(jnp.any(slots.timestep.terminated, axis=0))
 
 
-def begin(key: jax.Array):
+def begin(key: Array):
+  """Learner, worlds, empty replay and the expert's replay."""
   keys = jax.random.split(key, 3)
   world = reset(keys[0])
-  state = AGENT.init(keys[1], observe(world))
-  _, demos = rollout(expert, world, keys[2], 2 * LIMIT)
-  rows = jax.tree.map(lambda x: jnp.zeros((CAPACITY, *x.shape[1:]), x.dtype), demos)
-  return state, world, Buffer(rows, jnp.zeros((), jnp.int32)), demos
+  state = AGENT.init(keys[1], world.timestep.observation)
+  _, slots = rollout(expert, world, keys[2], 64)
+  example = jax.tree.map(lambda x: x[0, 0], slots)
+  demos = replay.add(replay.create(example, 64, WORLDS), slots)
+  return state, world, replay.create(example, 512, WORLDS), demos
+
+
+def train_step(carry, key: Array):
+  """Two steps of all worlds, then four updates."""
+  state, world, ring, demos = carry
+  key_play, key_learn = jax.random.split(key)
+  world, slots = rollout(agent(state, greedy=False), world, key_play, 2)
+  ring = replay.add(ring, slots)
+
+  def learn(state: LearnerState, key: Array):
+    key_draw, key_update = jax.random.split(key)
+    batch = replay.sample_mixed(
+      ring,
+      demos,
+      key_draw,
+      batch_size=64,
+      expert_share=0.25,
+      n_step=CONFIG.n_step,
+      gamma=CONFIG.gamma,
+    )
+    return AGENT.update(state, batch, key_update)
+
+  state, metrics = jax.lax.scan(learn, state, jax.random.split(key_learn, 4))
+  return (state, world, ring, demos), jax.tree.map(lambda x: x[-1], metrics)

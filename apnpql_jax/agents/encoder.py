@@ -16,6 +16,9 @@ PATCH = 4
 _STEP_SCALE = 7.0
 """Brings a joint's change per control period (0.15 rad at most) to order one."""
 
+_POSITION_SCALE = 5.0
+"""Brings positions within reach of the arm (m) to order one, centimetres to 0.05."""
+
 
 class PixelEncoder(nn.Module):
   """Two convolution layers with relu for one camera, flattened.
@@ -60,8 +63,9 @@ class Encoder(nn.Module):
     """Observation with batch *b -> f32[*b, feature_dim]."""
     body = functools.partial(nn.Dense, self.feature_dim)
     state = [robot_inputs(observation.robot)]
-    if observation.objects is not None:
-      state.append(observation.objects)
+    for positions in (observation.tool, observation.objects):
+      if positions is not None:
+        state.append(_POSITION_SCALE * positions)
     state = nn.relu(body(name="state")(jnp.concatenate(state, axis=-1)))
     x = body(name="from_state")(state)
     for name in ("global_image", "wrist_image"):

@@ -122,6 +122,7 @@ class Networks:
       min_std=self.config.min_std,
       initial_std=self.config.initial_std,
       max_std=self.config.max_std,
+      min_prob=self.config.min_prob,
     )
 
   def q_logits(self, params: Params, phi: Array, actions: Array) -> Array:
@@ -159,13 +160,22 @@ def make_networks(config: AgentConfig) -> Networks:
 
 
 def prior_from_outputs(
-  outputs: Array, mean: Array, *, min_std: float, initial_std: float, max_std: float
+  outputs: Array,
+  mean: Array,
+  *,
+  min_std: float,
+  initial_std: float,
+  max_std: float,
+  min_prob: float,
 ) -> gmm.GripperGMM:
   """Turns raw outputs of f^bp into the mixture around the given means.
 
-  Both ends of the spread matter. Below the floor, candidates would no longer differ;
-  and as long as all candidates are worth the same, nothing in the M-step pulls a
-  spread back that the entropy term once drove beyond the action box.
+  The prior must never exclude a choice: what it no longer proposes, q can neither
+  try nor find better. So components and gripper commands keep a smallest
+  probability, and the spread a floor; one entropy floor for all of them cannot see
+  to that, as a wide Gaussian makes up for a gripper that never opens. The spread has
+  a limit too: while all candidates are worth the same, nothing in the M-step pulls
+  it back into the action box.
 
   Args:
     outputs: f32[*b, K * (D (D + 1) / 2 + 2)].
@@ -173,6 +183,7 @@ def prior_from_outputs(
     min_std: floor of the diagonal of the Cholesky factors.
     initial_std: the diagonal where the outputs are zero.
     max_std: limit of the diagonal, and of the size of all entries below it.
+    min_prob: smallest weight of a component, smallest probability of a command.
   """
   num, dim = mean.shape[-2:]
   outputs = outputs.reshape(*outputs.shape[:-1], num, -1)
@@ -188,11 +199,13 @@ def prior_from_outputs(
   scale = scale.at[..., rows, columns].set(
     max_std * jnp.tanh(initial_std / max_std * below)
   )
+  weights = min_prob + (1.0 - num * min_prob) * jax.nn.softmax(logits[..., 0])
+  close = min_prob + (1.0 - 2.0 * min_prob) * jax.nn.sigmoid(gripper[..., 0])
   return gmm.GripperGMM(
-    logits=logits[..., 0],
+    logits=jnp.log(weights),
     mean=mean,
     scale_tril=scale,
-    gripper_logits=gripper[..., 0],
+    gripper_logits=jnp.log(close) - jnp.log1p(-close),
   )
 
 

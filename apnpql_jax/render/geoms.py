@@ -137,8 +137,11 @@ class Lighting:
   background: tuple[float, float, float] = (0.55, 0.65, 0.75)
   """Colour of rays that hit nothing, in [0, 1]."""
   shadow_casters: tuple[int, ...] = ()
-  """MuJoCo ids of geoms that throw a hard shadow on planes: spheres, capsules and
-  boxes on the lit side of the plane. Empty means no shadows and no cost."""
+  """MuJoCo ids of the spheres, capsules and boxes that throw hard shadows. Empty
+  means no shadows and no cost."""
+  shadow_receivers: tuple[int, ...] = ()
+  """MuJoCo ids of the geoms on which shadows fall. As seen from the light, every
+  receiver must lie behind every caster: a table under a gripper."""
   shadow: float = 0.4
   """Share of the intensity that a shadow takes away."""
 
@@ -151,6 +154,8 @@ class Lighting:
       )
     if not np.any(self.direction):
       raise ValueError("the light direction must not be zero")
+    if set(self.shadow_casters) & set(self.shadow_receivers):
+      raise ValueError("a geom cannot both cast and receive shadows")
 
   @classmethod
   def from_model(cls, model: mujoco.MjModel, **settings) -> Lighting:
@@ -164,13 +169,11 @@ class Lighting:
       ValueError: the model does not have exactly one directional light, or the
         light is fixed to a moving body.
     """
-    lights = np.flatnonzero(
-      model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
-    )
+    lights = np.flatnonzero(model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     if len(lights) != 1 or model.light_bodyid[lights[0]] != 0:
       raise ValueError("the scene needs exactly one directional light, in the world")
-    direction = tuple(float(x) for x in model.light_dir[lights[0]])
-    return cls(direction=direction, **settings)
+    x, y, z = model.light_dir[lights[0]].tolist()
+    return cls(direction=(x, y, z), **settings)
 
 
 def _effective_rgba(model: mujoco.MjModel) -> np.ndarray:

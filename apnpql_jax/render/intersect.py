@@ -193,7 +193,7 @@ def box_hit(g: Frames, rays: Rays, ray_light: Array) -> tuple[Array, Array]:
   enter = [slab[0] for slab in slabs]
   t = jnp.maximum(jnp.maximum(enter[0], enter[1]), enter[2])
   leave = jnp.minimum(jnp.minimum(slabs[0][1], slabs[1][1]), slabs[2][1])
-  hit = (t <= leave)
+  hit = t <= leave
   face = [_facing(d, g.light[k]) for k, d in enumerate(dirs)]
   cosine = jnp.where(t == enter[0], face[0], jnp.where(t == enter[1], face[1], face[2]))
   return jnp.where(hit, t, MISS), cosine

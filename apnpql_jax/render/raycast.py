@@ -11,13 +11,12 @@ XLA fuses the fold into what uses it and casts the scene again for each colour c
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 import functools
 
 from flax import struct
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from apnpql_jax.render import intersect, shadow
@@ -26,13 +25,13 @@ from apnpql_jax.render.geoms import CameraSpec, Geoms, Lighting
 Array = jax.Array
 
 OUTPUTS = ("rgb", "depth", "segmentation")
+DEFAULT_LIGHTING = Lighting()
 NEAR = 0.005
 """Default near limit in metres."""
 BLOCKS = 4
 """Blocks of pixels per image; one would be no loop."""
 
 _FULL = 255.0 / 256.0  # full intensity; below one, for the integer part is the colour
-_PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 
 
 @struct.dataclass
@@ -54,7 +53,7 @@ def render(
   geom_xmat: Array,
   cam_xpos: Array,
   cam_xmat: Array,
-  lighting: Lighting = Lighting(),
+  lighting: Lighting = DEFAULT_LIGHTING,
   *,
   outputs: Sequence[str] = OUTPUTS,
   near: float = NEAR,
@@ -79,8 +78,8 @@ def render(
     The image, with the leading axes of the poses.
 
   Raises:
-    ValueError: an output is unknown, the shapes do not fit, or a shadow caster is
-      not a drawn sphere, capsule or box.
+    ValueError: an output is unknown, the shapes do not fit, a shadow caster is not a
+      drawn sphere, capsule or box, or a shadow receiver is not drawn.
   """
   if not outputs or not set(outputs) <= set(OUTPUTS):
     raise ValueError(f"outputs must be some of {OUTPUTS}, got {tuple(outputs)}")
@@ -147,13 +146,13 @@ def _develop(
 ) -> Image:
   """Turns the blocks' depth and paint into the wanted outputs."""
   shape = (camera.height, camera.width)
-  crop = lambda x: x.reshape(-1)[: camera.height * camera.width]
+  pixels = camera.height * camera.width
   depth = rgb = segmentation = None
   if t is not None:
-    t = crop(t)
+    t = t.reshape(-1)[:pixels]
     depth = jnp.where(t < intersect.MISS, t, jnp.inf).reshape(shape)
   if paint is not None:
-    paint = crop(paint)
+    paint = paint.reshape(-1)[:pixels]
     colors, ids = _palette(geoms, lighting)
     index = jnp.floor(paint)
     entry = index.astype(jnp.int32)
@@ -192,30 +191,23 @@ def _cast(
   ray_light = intersect.along(basis[2], rays)
   t = jnp.full(rays.u.shape, intersect.MISS, jnp.float32)
   paint = jnp.full(rays.u.shape, 2 * len(geoms.ids) + _FULL, jnp.float32)
-  casters = _casters(geoms, lighting)
   for k, kind in enumerate(geoms.types.tolist()):
-    geom = jax.tree.map(lambda x, k=k: x[k], frames)
+    geom = _row(frames, k)
     t_k, cosine = intersect.HITS[kind](geom, rays, ray_light)
-    intensity = _intensity(lighting, cosine)
     index = float(k)
-    if kind == _PLANE:
-      if geoms.checker[k] > 0.0:
-        index = index + len(geoms.ids) * _odd_square(geom, rays, t_k, geoms.checker[k])
-      if casters:
-        dark = functools.reduce(
-          jnp.logical_or,
-          (
-            shadow.SHADOWS[int(geoms.types[c])](
-              jax.tree.map(lambda x, c=c: x[c], frames), rays, t_k, basis
-            )
-            for c in casters
-          ),
-        )
-        intensity = jnp.where(dark, (1.0 - lighting.shadow) * intensity, intensity)
+    if geoms.checker[k] > 0.0:
+      edge = float(geoms.checker[k])
+      index = index + len(geoms.ids) * _odd_square(geom, rays, t_k, edge)
     closer = (t_k < t) & (t_k > near)
     t = jnp.where(closer, t_k, t)
-    paint = jnp.where(closer, index + intensity, paint)
+    paint = jnp.where(closer, index + _intensity(lighting, cosine), paint)
+  if lighting.shadow_casters:
+    paint = _darken(geoms, lighting, frames, basis, rays, t, paint)
   return t, paint
+
+
+def _row(frames: intersect.Frames, k: int) -> intersect.Frames:
+  return jax.tree.map(lambda x: x[k], frames)
 
 
 def _intensity(lighting: Lighting, cosine: Array) -> Array:
@@ -234,15 +226,42 @@ def _odd_square(
   return square - 2.0 * jnp.floor(square * 0.5)
 
 
-def _casters(geoms: Geoms, lighting: Lighting) -> list[int]:
-  """Rows of ``geoms`` that cast shadows.
+def _darken(
+  geoms: Geoms,
+  lighting: Lighting,
+  frames: intersect.Frames,
+  basis: Array,
+  rays: intersect.Rays,
+  t: Array,
+  paint: Array,
+) -> Array:
+  """f32[P]: paint after the shadows have fallen."""
+  casters = _rows(geoms, lighting.shadow_casters, shadow.SHADOWS)
+  receivers = _rows(geoms, lighting.shadow_receivers, intersect.HITS)
+  dark = jnp.zeros(t.shape, bool)
+  for k in casters:
+    cast = shadow.SHADOWS[int(geoms.types[k])]
+    dark = dark | cast(_row(frames, k), rays, t, basis)
+  index = jnp.floor(paint)
+  receives = jnp.zeros(t.shape, bool)
+  for k in receivers:
+    receives = receives | (index == float(k))
+    if geoms.checker[k] > 0.0:
+      receives = receives | (index == float(k + len(geoms.ids)))
+  dimmed = index + (1.0 - lighting.shadow) * (paint - index)
+  return jnp.where(dark & receives, dimmed, paint)
+
+
+def _rows(geoms: Geoms, ids: tuple[int, ...], types: Container[int]) -> list[int]:
+  """Rows of ``geoms`` by MuJoCo id.
 
   Raises:
-    ValueError: a caster is not drawn or is not a sphere, capsule or box.
+    ValueError: a geom is not drawn or its type is not one of ``types``.
   """
-  rows = {int(i): k for k, i in enumerate(geoms.ids)}
-  valid = [i for i, k in rows.items() if int(geoms.types[k]) in shadow.SHADOWS]
-  wrong = [i for i in lighting.shadow_casters if i not in valid]
+  rows = {int(i): k for k, i in enumerate(geoms.ids) if int(geoms.types[k]) in types}
+  wrong = [i for i in ids if i not in rows]
   if wrong:
-    raise ValueError(f"geoms {wrong} cannot cast shadows; these can: {sorted(valid)}")
-  return [rows[i] for i in lighting.shadow_casters]
+    raise ValueError(
+      f"geoms {wrong} cannot take part in shadows; these can: {sorted(rows)}"
+    )
+  return [rows[i] for i in ids]

@@ -1,8 +1,8 @@
-"""Hard shadows of chosen geoms on planes, under a directional light.
+"""Hard shadows of chosen geoms on chosen others, under a directional light.
 
-The light's rays are parallel, so a plane's point is in the shadow of a capsule where
-the two are close after projection along the light: no root is needed. The caster
-must be on the lit side of the plane.
+The light's rays are parallel, so a point is in the shadow of a capsule where the two
+are close after projection along the light: no root is needed. That the caster is
+between light and point is taken for granted.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def capsule_shadow(g: Frames, rays: Rays, t: Array, basis: Array) -> Array:
     basis: f32[3, 3], ``light_basis`` in the camera's frame.
 
   Returns:
-    True where the segment towards the light meets the caster.
+    True where the line along the light meets the caster.
   """
   axis = [(g.z * basis[k]).sum() for k in range(2)]
   center = [(g.center * basis[k]).sum() for k in range(2)]
@@ -64,7 +64,7 @@ def box_shadow(g: Frames, rays: Rays, t: Array, basis: Array) -> Array:
     leave.append(middle + width)
   first = jnp.maximum(jnp.maximum(enter[0], enter[1]), enter[2])
   last = jnp.minimum(jnp.minimum(leave[0], leave[1]), leave[2])
-  return (first <= last) & (last > 0.0)
+  return first <= last
 
 
 SHADOWS: dict[int, Callable[[Frames, Rays, Array, Array], Array]] = {

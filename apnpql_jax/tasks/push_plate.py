@@ -2,8 +2,8 @@
 
 Primitives, so that following one of them never knocks the plate over:
 
-- object: go above the plate; once aligned, descend until the closed finger tips
-  are inside the rim; from inside, move to the plate's centre.
+- object: go above the plate and, through a funnel, down to its floor until the closed
+  finger tips are inside the rim; from inside, move to the plate's centre.
 - goal: from inside the rim, move by what the plate still lacks to the goal, so the
   plate is dragged along, the slower the less deep the tool is; from elsewhere, go
   above the goal.
@@ -57,8 +57,12 @@ LOW = 0.022
 INSIDE = 0.083
 """m; radius of the rim's centre line: a low tool closer than this is inside."""
 
-ALIGNED = 0.03
-"""m; a descent from here keeps 25 mm between tips and rim."""
+ALIGNED = 0.02
+"""m; this close to the plate's axis the tool descends: 35 mm between tips and rim."""
+
+FUNNEL = 0.055
+"""m; from here to ``ALIGNED`` the height falls linearly: tips just clear of the rim.
+A step would be sharper than a network can see in the images."""
 
 LOOKAHEAD = 0.07
 """m; longest step of a dragging tool's waypoint."""
@@ -105,14 +109,15 @@ class PushPlate:
     plate, goal = self._plate_xy(state), self._goal_xy(state)
     inside = self._inside(tool, plate)[:, None]
     above = (tool[:, 2] > CLEAR)[:, None]
-    aligned = (_norm(tool[:, :2] - plate) < ALIGNED)[:, None]
+    off = (_norm(tool[:, :2] - plate) - ALIGNED) / (FUNNEL - ALIGNED)
+    funnel = DRAG_HEIGHT + (HOVER_HEIGHT - DRAG_HEIGHT) * off.clip(0.0, 1.0)
 
     def waypoint(xy, height):
-      return jnp.concatenate([xy, jnp.full_like(xy[:, :1], height)], -1)
+      return jnp.stack([xy[:, 0], xy[:, 1], jnp.broadcast_to(height, xy[:, 0].shape)], -1)
 
     rise = waypoint(tool[:, :2], HOVER_HEIGHT)
-    over_plate = jnp.where(above, waypoint(plate, HOVER_HEIGHT), rise)
-    to_object = jnp.where(inside | aligned, waypoint(plate, DRAG_HEIGHT), over_plate)
+    onto_plate = jnp.where(above | (off < 1)[:, None], waypoint(plate, funnel), rise)
+    to_object = jnp.where(inside, waypoint(plate, DRAG_HEIGHT), onto_plate)
     depth = ((LOW - tool[:, 2]) / (LOW - DRAG_HEIGHT)).clip(0.0, 1.0)
     drag = goal - plate
     reach = depth * LOOKAHEAD / jnp.maximum(_norm(drag), LOOKAHEAD)

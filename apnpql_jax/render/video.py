@@ -1,0 +1,123 @@
+"""Videos of episodes: camera images laid out side by side, framed, and written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import importlib.util
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+
+GREEN = (40, 200, 80)
+RED = (220, 60, 50)
+
+_MACROBLOCK = 16  # common video codecs want sides that are multiples of it
+
+
+def tile(views: Sequence[np.ndarray], *, gap: int = 2) -> np.ndarray:
+  """Puts a large view on the left and the others in a column to its right.
+
+  The others are enlarged by whole factors, nearest neighbour, so that each fills its
+  share of the large view's height as far as it fits; what remains is black.
+
+  Args:
+    views: u8[T, H_i, W_i, 3], the large view first.
+    gap: black pixels between views.
+
+  Returns:
+    u8[T, H_0, W, 3].
+
+  Raises:
+    ValueError: no views, or they are not videos of equal length.
+  """
+  if not views:
+    raise ValueError("no views to tile")
+  for view in views:
+    _check(view)
+    if len(view) != len(views[0]):
+      raise ValueError(f"views differ in length: {[len(v) for v in views]}")
+  large, others = views[0], views[1:]
+  if not others:
+    return large.copy()
+  frames, height = large.shape[:2]
+  share = (height - gap * (len(others) - 1)) // len(others)
+  enlarged = [enlarge(v, max(1, share // v.shape[1])) for v in others]
+  width = max(v.shape[2] for v in enlarged)
+  needed = sum(v.shape[1] for v in enlarged) + gap * (len(others) - 1)
+  out = np.zeros(
+    (frames, max(height, needed), large.shape[2] + gap + width, 3), np.uint8
+  )
+  out[:, :height, : large.shape[2]] = large
+  top, left = 0, large.shape[2] + gap
+  for view in enlarged:
+    out[:, top : top + view.shape[1], left : left + view.shape[2]] = view
+    top += view.shape[1] + gap
+  return out
+
+
+def enlarge(frames: np.ndarray, factor: int) -> np.ndarray:
+  """Repeats every pixel ``factor`` times both ways: u8[T, H * f, W * f, 3]."""
+  return frames.repeat(factor, axis=1).repeat(factor, axis=2)
+
+
+def add_border(
+  frames: np.ndarray,
+  color: tuple[int, int, int],
+  *,
+  where: np.ndarray | None = None,
+  width: int = 4,
+) -> np.ndarray:
+  """Draws a border inside the frames, for instance green where an episode succeeded.
+
+  Args:
+    frames: u8[T, H, W, 3].
+    color: red, green, blue in 0..255.
+    where: bool[T], frames to mark; all of them by default.
+    width: of the border in pixels.
+
+  Returns:
+    A copy with the border.
+  """
+  _check(frames)
+  out = frames.copy()
+  marked = np.ones(len(frames), bool) if where is None else np.asarray(where, bool)
+  inner = np.zeros(frames.shape[1:3], bool)
+  inner[width : frames.shape[1] - width, width : frames.shape[2] - width] = True
+  out[marked[:, None, None] & ~inner[None]] = color
+  return out
+
+
+def write_video(path: str | Path, frames: np.ndarray, *, fps: float) -> Path:
+  """Writes frames as MP4; as GIF if the path says so or where ffmpeg is missing.
+
+  Args:
+    path: file to write; any suffix but ".gif" becomes ".mp4".
+    frames: u8[T, H, W, 3]; padded with black to what the codec needs.
+    fps: frames per second of playback.
+
+  Returns:
+    The path that was written.
+
+  Raises:
+    ValueError: the frames are not u8[T, H, W, 3] or there are none.
+  """
+  _check(frames)
+  path = Path(path)
+  if path.suffix == ".gif" or importlib.util.find_spec("imageio_ffmpeg") is None:
+    path = path.with_suffix(".gif")
+    iio.imwrite(path, frames, duration=1000.0 / fps, loop=0)
+    return path
+  path = path.with_suffix(".mp4")
+  padding = [-side % _MACROBLOCK for side in frames.shape[1:3]]
+  frames = np.pad(frames, ((0, 0), (0, padding[0]), (0, padding[1]), (0, 0)))
+  # The range of quality is 0 to 10. Flat colours and hard edges need a high one.
+  iio.imwrite(path, frames, plugin="FFMPEG", fps=fps, codec="libx264", quality=8)
+  return path
+
+
+def _check(frames: np.ndarray) -> None:
+  if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8:
+    raise ValueError(f"need u8[T, H, W, 3], got {frames.dtype}{list(frames.shape)}")
+  if not frames.size:
+    raise ValueError(f"no frames: {list(frames.shape)}")

@@ -1,0 +1,88 @@
+"""Action primitives: targets against mink, and following them without overshoot."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from apnpql_jax.primitives import bank, ik, tracking
+from apnpql_jax.sim import arm
+from apnpql_jax.sim.kinematics import make_kinematics
+
+
+@pytest.fixture(scope="module")
+def small_bank(task, tmp_path_factory):
+  """A bank built from nothing in an empty cache, and its report."""
+  with pytest.MonkeyPatch.context() as patch:
+    patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+    built = bank.load_bank(task, 48)
+    again = bank.load_bank(task, 48)
+  jax.tree.map(np.testing.assert_array_equal, built[0], again[0])
+  assert built[1] == again[1]
+  return built
+
+
+def test_bank_targets_reach_their_poses(task, small_bank):
+  """mink's targets, checked with C MuJoCo's kinematics of the whole scene."""
+  rows, report = small_bank
+  assert rows.rows == 48
+  assert report.max_position_residual < ik.POSITION_TOLERANCE
+  assert report.max_rotation_residual < ik.ROTATION_TOLERANCE
+  state = _at(task, rows)
+  positions, rotations = task.tool_targets(state, make_kinematics(task.scene)(state))
+  reached, turned, _ = arm.forward(arm.make_chain(task.scene), rows.targets)
+  np.testing.assert_allclose(reached, positions, atol=1e-3)
+  angle = np.linalg.norm(arm.rotation_error(turned, rotations), axis=-1)
+  assert angle.max() < ik.ROTATION_TOLERANCE
+
+
+def test_refinement_agrees_with_mink(task, small_bank):
+  """From targets of a scene 5 cm away, the in-jit steps find mink's solution."""
+  rows, _ = small_bank
+  chain, solver = arm.make_chain(task.scene), ik.IkSolver()
+  target = rows.targets[:, 0]
+  position, rotation, _ = arm.forward(chain, target)
+  shift = np.random.default_rng(0).uniform(-0.05, 0.05, position.shape)
+  moved = position + jnp.asarray(shift, jnp.float32)
+  refined = jax.jit(tracking.refine)(chain, target, moved, rotation)
+  for i in range(16):
+    exact = solver.solve(np.asarray(target[i]), moved[i], np.asarray(rotation[i]))
+    assert exact.reached
+    np.testing.assert_allclose(refined[i], exact.q, atol=2e-3)
+
+
+def test_following_scales_as_a_whole():
+  velocity = tracking.follow(jnp.array([2.0, -1.0, 0, 0, 0, 0]), jnp.zeros(6))
+  np.testing.assert_allclose(velocity, [1.0, -0.5, 0, 0, 0, 0], rtol=1e-6)
+  near = tracking.follow(jnp.full(6, 0.01), jnp.zeros(6))
+  np.testing.assert_allclose(near, tracking.GAIN * 0.01, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["native", "mjx"])
+def test_following_reaches_a_target_without_overshoot(engines, resets, task, name):
+  """From anywhere near the workspace, at rest, to anywhere near it."""
+  scene, step = task.scene, engines[name]
+  worlds = resets.qpos.shape[0]
+  rng = np.random.default_rng(5)
+  neutral = task.scene.keyframe("neutral")[scene.arm_qpos]
+  spread = np.array([0.8, 0.3, 0.4, 0.6, 0.6, 1.2])
+  start, target = neutral + rng.uniform(-spread, spread, (2, worlds, 6))
+  state = resets.replace(qpos=resets.qpos.at[:, scene.arm_qpos].set(start))
+  target, close = jnp.asarray(target, jnp.float32), jnp.ones(worlds)
+  side = np.sign(target - start)
+  overshoot = 0.0
+  for _ in range(50):
+    q = state.qpos[:, scene.arm_qpos]
+    state = step(state, tracking.follow(target, q), close)
+    beyond = side * np.asarray(state.qpos[:, scene.arm_qpos] - target)
+    overshoot = max(overshoot, beyond.max())
+  assert overshoot < 0.02
+  np.testing.assert_allclose(state.qpos[:, scene.arm_qpos], target, atol=0.02)
+
+
+def _at(task, rows):
+  from apnpql_jax.sim import physics
+
+  return physics.initial_state(task.scene, rows.qpos, rows.mocap_pos, rows.mocap_quat)
