@@ -192,7 +192,8 @@ def camera_renderer(scene: Scene, name: str, size: tuple[int, int]) -> Renderer:
       kinematics.geom_xmat,
       kinematics.cam_xpos[:, index],
       kinematics.cam_xmat[:, index],
-      lighting=lighting,
+      lighting,
+      outputs=("rgb",),
     ).rgb
 
   return renderer

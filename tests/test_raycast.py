@@ -345,9 +345,8 @@ def test_shadows_fall_where_rays_to_the_light_are_blocked(world):
   )
   expected &= on_floor
   assert expected.mean() > 0.01
-  interior = _interior(expected.astype(np.int32)) & on_floor
-  assert (changed == expected)[interior].mean() >= 0.999
-  assert changed[interior & expected].mean() >= 0.99
+  # Rays decide both pictures, so edges count too.
+  assert (changed != expected)[on_floor].sum() <= 2
 
 
 @pytest.mark.parametrize("repeat", [2, 5])

@@ -6,7 +6,7 @@ closed over by the compiled program; only poses are arguments of it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 import dataclasses
 
 import mujoco
@@ -80,6 +80,20 @@ class Geoms:
       checker=checker.astype(np.float32),
       checker_colors=odd_colors.astype(np.float32),
     )
+
+  def rows(self, ids: Sequence[int], types: Container[int]) -> list[int]:
+    """Rows of the geoms that take part in shadows.
+
+    Raises:
+      ValueError: a geom is not drawn or its type is not one of ``types``.
+    """
+    rows = {int(i): k for k, i in enumerate(self.ids) if int(self.types[k]) in types}
+    wrong = [i for i in ids if i not in rows]
+    if wrong:
+      raise ValueError(
+        f"geoms {wrong} cannot take part in shadows; these can: {sorted(rows)}"
+      )
+    return [rows[i] for i in ids]
 
 
 @dataclasses.dataclass(frozen=True)

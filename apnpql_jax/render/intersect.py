@@ -93,6 +93,11 @@ def prepare(center: Array, axes: Array, size: np.ndarray, to_light: Array) -> Fr
   )
 
 
+def row(frames: Frames, k: int) -> Frames:
+  """The frame of geom k alone."""
+  return Frames(*(field[k] for field in frames))
+
+
 def plane_hit(g: Frames, rays: Rays, ray_light: Array) -> tuple[Array, Array]:
   """A plane, seen from its front only; rectangular where its sizes are positive."""
   del ray_light

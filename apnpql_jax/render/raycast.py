@@ -11,7 +11,7 @@ XLA fuses the fold into what uses it and casts the scene again for each colour c
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Sequence
 import functools
 
 from flax import struct
@@ -192,7 +192,7 @@ def _cast(
   t = jnp.full(rays.u.shape, intersect.MISS, jnp.float32)
   paint = jnp.full(rays.u.shape, 2 * len(geoms.ids) + _FULL, jnp.float32)
   for k, kind in enumerate(geoms.types.tolist()):
-    geom = _row(frames, k)
+    geom = intersect.row(frames, k)
     t_k, cosine = intersect.HITS[kind](geom, rays, ray_light)
     index = float(k)
     if geoms.checker[k] > 0.0:
@@ -204,10 +204,6 @@ def _cast(
   if lighting.shadow_casters:
     paint = _darken(geoms, lighting, frames, basis, rays, t, paint)
   return t, paint
-
-
-def _row(frames: intersect.Frames, k: int) -> intersect.Frames:
-  return jax.tree.map(lambda x: x[k], frames)
 
 
 def _intensity(lighting: Lighting, cosine: Array) -> Array:
@@ -236,32 +232,12 @@ def _darken(
   paint: Array,
 ) -> Array:
   """f32[P]: paint after the shadows have fallen."""
-  casters = _rows(geoms, lighting.shadow_casters, shadow.SHADOWS)
-  receivers = _rows(geoms, lighting.shadow_receivers, intersect.HITS)
-  dark = jnp.zeros(t.shape, bool)
-  for k in casters:
-    cast = shadow.SHADOWS[int(geoms.types[k])]
-    dark = dark | cast(_row(frames, k), rays, t, basis)
+  dark = shadow.darkness(geoms, lighting.shadow_casters, frames, rays, t, basis)
   index = jnp.floor(paint)
   receives = jnp.zeros(t.shape, bool)
-  for k in receivers:
+  for k in geoms.rows(lighting.shadow_receivers, intersect.HITS):
     receives = receives | (index == float(k))
     if geoms.checker[k] > 0.0:
       receives = receives | (index == float(k + len(geoms.ids)))
   dimmed = index + (1.0 - lighting.shadow) * (paint - index)
   return jnp.where(dark & receives, dimmed, paint)
-
-
-def _rows(geoms: Geoms, ids: tuple[int, ...], types: Container[int]) -> list[int]:
-  """Rows of ``geoms`` by MuJoCo id.
-
-  Raises:
-    ValueError: a geom is not drawn or its type is not one of ``types``.
-  """
-  rows = {int(i): k for k, i in enumerate(geoms.ids) if int(geoms.types[k]) in types}
-  wrong = [i for i in ids if i not in rows]
-  if wrong:
-    raise ValueError(
-      f"geoms {wrong} cannot take part in shadows; these can: {sorted(rows)}"
-    )
-  return [rows[i] for i in ids]

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from apnpql_jax.render.intersect import Frames, Rays, along
+from apnpql_jax.render.geoms import Geoms
+from apnpql_jax.render.intersect import Frames, Rays, along, row
 
 Array = jax.Array
 
@@ -73,3 +74,22 @@ SHADOWS: dict[int, Callable[[Frames, Rays, Array, Array], Array]] = {
   int(mujoco.mjtGeom.mjGEOM_BOX): box_shadow,
 }
 """Shadow test by ``mujoco.mjtGeom``."""
+
+
+def darkness(
+  geoms: Geoms,
+  casters: tuple[int, ...],
+  frames: Frames,
+  rays: Rays,
+  t: Array,
+  basis: Array,
+) -> Array:
+  """bool[P]: whether any of the casters, given by MuJoCo id, darkens a point.
+
+  Raises:
+    ValueError: a caster is not drawn or is not a sphere, capsule or box.
+  """
+  dark = jnp.zeros(t.shape, bool)
+  for k in geoms.rows(casters, SHADOWS):
+    dark = dark | SHADOWS[int(geoms.types[k])](row(frames, k), rays, t, basis)
+  return dark
