@@ -16,13 +16,13 @@ import jax.numpy as jnp
 
 from apnpql_jax.config import EnvConfig
 from apnpql_jax.primitives import tracking
-from apnpql_jax.primitives.bank import load_bank, ResetBank
+from apnpql_jax.primitives.bank import ResetBank, load_bank
 from apnpql_jax.render import CameraSpec, Geoms, Lighting, render
 from apnpql_jax.sim import arm, physics
 from apnpql_jax.sim.kinematics import Kinematics, make_kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.sim.scene import Scene
-from apnpql_jax.tasks import make_task, Task
+from apnpql_jax.tasks import Task, make_task
 from apnpql_jax.types import Array, Observation, TimeStep
 
 GLOBAL_SIZE = (72, 96)

@@ -20,7 +20,7 @@ from apnpql_jax.config import EnvConfig
 from apnpql_jax.env import Env, make_env
 from apnpql_jax.iteration import initial_state
 from apnpql_jax.metrics import wilson_interval
-from apnpql_jax.rollout import agent_policy, expert_policy, Policy
+from apnpql_jax.rollout import Policy, agent_policy, expert_policy
 from apnpql_jax.types import Array
 
 MAX_WORLDS = 64
@@ -80,8 +80,10 @@ def play_held_out(
   size = math.ceil(episodes / turns)
   # The last turn is filled up, so that one compiled size serves all.
   padded = np.resize(rows, turns * size).reshape(turns, size)
-  played = [play(params, jnp.asarray(r), jax.random.fold_in(key, i))
-            for i, r in enumerate(padded)]
+  played = [
+    play(params, jnp.asarray(r), jax.random.fold_in(key, i))
+    for i, r in enumerate(padded)
+  ]
   success, length = (
     np.concatenate([np.asarray(getattr(p, f)) for p in played])[:episodes]
     for f in ("success", "length")

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax.env import camera_renderer, Env, EnvState
+from apnpql_jax.env import Env, EnvState, camera_renderer
 from apnpql_jax.render.video import tile, write_video
 from apnpql_jax.rollout import Policy
 from apnpql_jax.types import Array
@@ -46,9 +46,7 @@ def record_episodes(env: Env, policy: Policy, path: Path) -> None:
   write_video(path, np.concatenate(frames), fps=1 / env.config.control_period_s)
 
 
-def _play(
-  env: Env, policy: Policy, rows: Array, key: Array
-) -> tuple[EnvState, Array]:
+def _play(env: Env, policy: Policy, rows: Array, key: Array) -> tuple[EnvState, Array]:
   """Physics states [time, episodes, ...] and which episodes were still running."""
 
   def period(carry, key):

@@ -21,7 +21,7 @@ from apnpql_jax.agents.learner import Agent, make_agent
 from apnpql_jax.config import TrainConfig
 from apnpql_jax.env import Env, make_env
 from apnpql_jax.evaluate import make_player, play_held_out
-from apnpql_jax.iteration import initial_state, make_iteration, TrainState
+from apnpql_jax.iteration import TrainState, initial_state, make_iteration
 from apnpql_jax.metrics import MetricWriter, plot_curve, read_rows
 from apnpql_jax.progress import TrainProgress
 from apnpql_jax.recording import record_episodes
@@ -67,7 +67,9 @@ def train(config: TrainConfig, run_dir: Path, *, resume: bool) -> dict[str, Any]
     caught_signals() as caught,
   ):
     reporter = _Reporter(config, env, agent, folder, writer, progress)
-    state = _loop(config, make_iteration(config, env, agent), state, reporter, saver, caught)
+    state = _loop(
+      config, make_iteration(config, env, agent), state, reporter, saver, caught
+    )
   if caught:
     raise KeyboardInterrupt
   return {
@@ -182,6 +184,4 @@ def _passed(before: int, now: int, every: int) -> bool:
 
 
 def _nbytes(tree: Any) -> int:
-  return sum(
-    math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(tree)
-  )
+  return sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(tree))

@@ -61,4 +61,4 @@ class Transition:
   discount_t: Array  # f32[B]: gamma^m, zero where the episode terminated
   observation_t: Observation  # [B, ...]: state to bootstrap from
   primitives_tm1: Array  # f32[B, 3, 6]: labels of the action primitives
-  weight: Array  # f32[B]: one where the transition is real, zero where it must not count
+  weight: Array  # f32[B]: one where the transition is real, zero where it is not

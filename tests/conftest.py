@@ -12,7 +12,7 @@ import pytest
 
 import apnpql_jax  # noqa: F401  (sets threads and the compilation cache)
 from apnpql_jax.sim import physics
-from apnpql_jax.tasks import make_task, Task
+from apnpql_jax.tasks import Task, make_task
 
 # Figures are written to files; no test may need a display.
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -40,6 +40,4 @@ def engines(task: Task) -> dict[str, Callable]:
 def resets(task: Task) -> physics.PhysicsState:
   """``WORLDS`` initial states as the task draws them."""
   draw = task.sample_resets(np.random.default_rng(3), WORLDS)
-  return physics.initial_state(
-    task.scene, *(jnp.asarray(x, jnp.float32) for x in draw)
-  )
+  return physics.initial_state(task.scene, *(jnp.asarray(x, jnp.float32) for x in draw))

@@ -10,7 +10,16 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "apnpql_jax"
 NAME = PACKAGE.name
 
-LOOP = {"rollout", "evaluate", "train", "cli", "options", "__main__"}
+LOOP = {
+  "rollout",
+  "iteration",
+  "evaluate",
+  "recording",
+  "train",
+  "cli",
+  "options",
+  "__main__",
+}
 """Modules that see both the world and the agent, or start those that do."""
 
 WORLD = {"sim", "render", "primitives", "tasks", "env"}

@@ -76,7 +76,9 @@ def test_velocity_and_acceleration_limits_hold(random_play, name: str, resets):
 
 @pytest.mark.parametrize("name", ENGINES)
 def test_commanded_velocity_is_reached(engines, resets, name: str):
-  wanted = jnp.tile(jnp.array([0.3, -0.1, 0.1, -0.2, 0.2, -0.3]), (resets.qpos.shape[0], 1))
+  wanted = jnp.tile(
+    jnp.array([0.3, -0.1, 0.1, -0.2, 0.2, -0.3]), (resets.qpos.shape[0], 1)
+  )
   state = resets
   for _ in range(6):
     state = engines[name](state, wanted, jnp.ones(wanted.shape[0]))
@@ -93,7 +95,9 @@ def test_arm_commanded_into_the_table_stays_finite(engines, resets, task, name: 
     assert np.isfinite(state.qpos).all() and np.isfinite(state.qvel).all()
   assert np.abs(state.qvel[:, :6]).max() < 3.0
   kinematics = make_kinematics(scene)(state)
-  tips = kinematics.geom_xpos[:, [scene.id("geom", g) for g in ("r_tip", "l_tip", "hand")], 2]
+  tips = kinematics.geom_xpos[
+    :, [scene.id("geom", g) for g in ("r_tip", "l_tip", "hand")], 2
+  ]
   assert tips.min() > -0.02
 
 

@@ -75,9 +75,7 @@ def test_jax_kinematics_agree_with_mujoco(task):
     angular = np.zeros_like(linear)
     mujoco.mj_jacSite(scene.model, data, linear, angular, scene.tool_site)
     expected = np.concatenate([linear, angular])[:, scene.arm_dof]
-    np.testing.assert_allclose(
-      position[i], data.site_xpos[scene.tool_site], atol=1e-5
-    )
+    np.testing.assert_allclose(position[i], data.site_xpos[scene.tool_site], atol=1e-5)
     np.testing.assert_allclose(
       rotation[i].ravel(), data.site_xmat[scene.tool_site], atol=1e-5
     )
@@ -99,15 +97,15 @@ def test_rotation_error_agrees_with_mujoco():
     mujoco.mju_mulQuat(difference, quats[1], inverse)
     mujoco.mju_quat2Vel(expected, difference, 1.0)
     current, target = jnp.asarray(mats.reshape(2, 3, 3), jnp.float32)
-    np.testing.assert_allclose(
-      arm.rotation_error(current, target), expected, atol=2e-4
-    )
+    np.testing.assert_allclose(arm.rotation_error(current, target), expected, atol=2e-4)
 
 
 def test_gripper_follows_the_closed_form(task):
   """Pad gap and tip height of the maker's closed form, over the whole stroke."""
   model, data = task.scene.model, mujoco.MjData(task.scene.model)
-  fingers = [model.joint(f"finger_{name}").qposadr[0] for name in ("r1", "r2", "l1", "l2")]
+  fingers = [
+    model.joint(f"finger_{name}").qposadr[0] for name in ("r1", "r2", "l1", "l2")
+  ]
   for angle in np.linspace(0, 1.1, 12):
     data.qpos[fingers] = angle
     mujoco.mj_forward(model, data)

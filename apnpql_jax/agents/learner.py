@@ -83,9 +83,9 @@ def make_agent(config: AgentConfig) -> Agent:
     state: LearnerState, batch: Transition, key: Array
   ) -> tuple[LearnerState, Metrics]:
     key_t, key_tm1 = jax.random.split(key)
-    target = _value_target(networks, algorithm, state.target_params, batch, key_t)
+    target = bellman_target(networks, algorithm, state.target_params, batch, key_t)
     trained = {**state.params, "nu": state.nu}
-    grads, metrics = jax.grad(_total_loss, argnums=2, has_aux=True)(
+    grads, metrics = jax.grad(total_loss, argnums=2, has_aux=True)(
       networks, algorithm, trained, batch, target, key_tm1
     )
     steps, opt_state = optimiser.update(grads, state.opt_state, trained)
@@ -162,7 +162,7 @@ def _act(
   return actions, info
 
 
-def _value_target(
+def bellman_target(
   networks: Networks,
   algorithm: Algorithm,
   target_params: Params,
@@ -188,7 +188,7 @@ def _value_target(
   )
 
 
-def _total_loss(
+def total_loss(
   networks: Networks,
   algorithm: Algorithm,
   trained: Params,

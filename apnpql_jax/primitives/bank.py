@@ -161,7 +161,9 @@ def _solve_chunk(starts, positions, rotations) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cache_path(task: Task, rows: int) -> pathlib.Path:
-  key = json.dumps([VERSION, SEED, rows, task.name, task.scene.fingerprint, _source(task)])
+  key = json.dumps(
+    [VERSION, SEED, rows, task.name, task.scene.fingerprint, _source(task)]
+  )
   digest = hashlib.sha256(key.encode()).hexdigest()[:16]
   return cache_dir() / "banks" / f"{task.name}-{rows}-{digest}.npz"
 
@@ -177,6 +179,8 @@ def _store(path: pathlib.Path, bank: ResetBank, report: BankReport) -> None:
   """Writes atomically, so that two runs at once never see half a file."""
   path.parent.mkdir(parents=True, exist_ok=True)
   arrays = {f: np.asarray(getattr(bank, f)) for f in ResetBank.__dataclass_fields__}
-  with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".npz", delete=False) as file:
+  with tempfile.NamedTemporaryFile(
+    dir=path.parent, suffix=".npz", delete=False
+  ) as file:
     np.savez(file, report=json.dumps(dataclasses.asdict(report)), **arrays)
   os.replace(file.name, path)

@@ -66,9 +66,7 @@ def guard_body_tree() -> None:
     def behind_barrier(*inputs):
       return jax.lax.optimization_barrier(f(*inputs))
 
-    return original(
-      m, behind_barrier, in_types, out_types, *args, reverse=reverse
-    )
+    return original(m, behind_barrier, in_types, out_types, *args, reverse=reverse)
 
   body_tree.guarded = True
   _mjx_scan.body_tree = body_tree

@@ -39,7 +39,6 @@ class MjxPhysics:
     data = self._template.replace(
       qpos=state.qpos,
       qvel=state.qvel,
-      act=state.act,
       qacc_warmstart=state.qacc_warmstart,
       mocap_pos=state.mocap_pos,
       mocap_quat=state.mocap_quat,
@@ -53,7 +52,6 @@ class MjxPhysics:
     return state.replace(
       qpos=data.qpos,
       qvel=data.qvel,
-      act=data.act,
       qacc_warmstart=data.qacc_warmstart,
       time=data.time,
     )

@@ -10,7 +10,6 @@ import functools
 import threading
 
 import jax
-import jax.numpy as jnp
 import mujoco
 from mujoco import batch as mujoco_batch
 import numpy as np
@@ -23,7 +22,6 @@ from apnpql_jax.types import Array
 _STATE_FIELDS = (
   "qpos",
   "qvel",
-  "act",
   "qacc_warmstart",
   "mocap_pos",
   "mocap_quat",

@@ -48,7 +48,6 @@ class PhysicsState:
 
   qpos: Array  # f32[*b, nq]
   qvel: Array  # f32[*b, nv]
-  act: Array  # f32[*b, na]
   qacc_warmstart: Array  # f32[*b, nv]
   mocap_pos: Array  # f32[*b, nmocap, 3]
   mocap_quat: Array  # f32[*b, nmocap, 4]
@@ -107,7 +106,6 @@ def initial_state(
   return PhysicsState(
     qpos=qpos,
     qvel=jnp.zeros((*batch, model.nv)),
-    act=jnp.zeros((*batch, model.na)),
     qacc_warmstart=jnp.zeros((*batch, model.nv)),
     mocap_pos=mocap_pos,
     mocap_quat=mocap_quat,

@@ -65,9 +65,7 @@ class Scene:
   def free_joint(self, body: str) -> tuple[int, int]:
     """(qpos, qvel) addresses of the free joint of ``body``."""
     joint = self.model.body_jntadr[self.id("body", body)]
-    is_free = joint >= 0 and (
-      self.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE
-    )
+    is_free = joint >= 0 and (self.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE)
     if not is_free:
       raise ConfigError(f"{self.name}.xml: body '{body}' has no free joint")
     return int(self.model.jnt_qposadr[joint]), int(self.model.jnt_dofadr[joint])
@@ -140,11 +138,12 @@ def refuse_unsupported(model: mujoco.MjModel, name: str) -> None:
     ),
     "option/flag sleep": bool(option.enableflags & int(sleep)),
     "geom/surfacevel": bool(np.any(getattr(model, "geom_surfacevel", 0))),
+    "actuators with activation (not part of PhysicsState)": model.na > 0,
     "geom/adhesion": bool(np.any(getattr(model, "geom_adhesion", 0))),
   }
   names = [feature for feature, used in found.items() if used]
   if names:
-    raise ConfigError(f"{name}.xml uses what MJX ignores: {', '.join(names)}")
+    raise ConfigError(f"{name}.xml uses what is not simulated: {', '.join(names)}")
 
 
 def _named_id(model: mujoco.MjModel, scene: str, kind: str, name: str) -> int:
@@ -152,14 +151,12 @@ def _named_id(model: mujoco.MjModel, scene: str, kind: str, name: str) -> int:
   try:
     return int(accessor(name).id)
   except KeyError:
-    count = getattr(model, {"body": "nbody", "joint": "njnt", "camera": "ncam"}.get(
-      kind, f"n{kind}"
-    ))
+    count = getattr(
+      model, {"body": "nbody", "joint": "njnt", "camera": "ncam"}.get(kind, f"n{kind}")
+    )
     names = [accessor(i).name for i in range(count)]
     valid = ", ".join(n for n in names if n) or "none"
-    raise ConfigError(
-      f"{scene}.xml has no {kind} '{name}' (valid: {valid})"
-    ) from None
+    raise ConfigError(f"{scene}.xml has no {kind} '{name}' (valid: {valid})") from None
 
 
 def _fingerprint(model: mujoco.MjModel) -> str:

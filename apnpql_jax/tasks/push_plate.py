@@ -24,7 +24,7 @@ from apnpql_jax.sim import arm
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.sim.scene import load_scene
-from apnpql_jax.tasks.task import register, ResetDraw
+from apnpql_jax.tasks.task import ResetDraw, register
 from apnpql_jax.types import Array
 
 WORKSPACE = ((0.36, 0.58), (-0.24, 0.24))
@@ -113,7 +113,9 @@ class PushPlate:
     funnel = DRAG_HEIGHT + (HOVER_HEIGHT - DRAG_HEIGHT) * off.clip(0.0, 1.0)
 
     def waypoint(xy, height):
-      return jnp.stack([xy[:, 0], xy[:, 1], jnp.broadcast_to(height, xy[:, 0].shape)], -1)
+      return jnp.stack(
+        [xy[:, 0], xy[:, 1], jnp.broadcast_to(height, xy[:, 0].shape)], -1
+      )
 
     rise = waypoint(tool[:, :2], HOVER_HEIGHT)
     onto_plate = jnp.where(above | (off < 1)[:, None], waypoint(plate, funnel), rise)

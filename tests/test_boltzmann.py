@@ -1,0 +1,102 @@
+"""The non-parametric policy against rlax, scipy and its own limits."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import rlax
+from scipy import optimize, special
+
+from apnpql_jax.dists import boltzmann
+
+SAMPLES = 100
+
+
+def random_q(seed: int, batch: int = 8) -> jax.Array:
+  rng = np.random.default_rng(seed)
+  return jnp.asarray(rng.beta(0.5, 1.0, size=(SAMPLES, batch)), jnp.float32)
+
+
+def test_weights_and_dual_match_rlax():
+  q, alpha = random_q(0), jnp.geomspace(0.02, 2.0, 8)
+  expected, weights, _ = rlax.mpo_compute_weights_and_temperature_loss(
+    sample_q_values=q,
+    temperature_constraint=rlax.LagrangePenalty(alpha, jnp.float32(1.5)),
+    projection_operator=lambda x: x,
+    sample_axis=0,
+  )
+  ours = boltzmann.dual(q, alpha, epsilon=1.5)
+  np.testing.assert_allclose(ours, expected, rtol=1e-5, atol=1e-6)
+  np.testing.assert_allclose(
+    boltzmann.importance_weights(q, alpha), weights, atol=1e-6
+  )
+
+
+@pytest.mark.parametrize("epsilon", [0.2, 1.0, 2.5])
+def test_the_limit_holds_exactly_at_the_minimum_of_the_dual(epsilon: float):
+  q = random_q(1)
+  for i in range(q.shape[1]):
+    values = np.asarray(q[:, i], np.float64)
+
+    def dual(log_alpha: float, values=values) -> float:
+      alpha = np.exp(log_alpha)
+      mean = special.logsumexp(values / alpha) - np.log(SAMPLES)
+      return alpha * (epsilon + mean)
+
+    found = optimize.minimize_scalar(dual, bounds=(-9.0, 4.0), method="bounded")
+    alpha = jnp.exp(jnp.full((1,), found.x, jnp.float32))
+    one = q[:, i : i + 1]
+    ours = boltzmann.dual(one, alpha, epsilon=epsilon)[0]
+    assert ours == pytest.approx(found.fun, rel=1e-4)
+    kl = boltzmann.kl_to_prior(boltzmann.importance_weights(one, alpha))[0]
+    assert kl == pytest.approx(epsilon, abs=5e-3)
+
+
+def test_slope_of_the_dual_is_the_slack_of_the_limit():
+  q, alpha = random_q(2), jnp.geomspace(0.02, 1.0, 8)
+  slope = jax.grad(lambda a: jnp.sum(boltzmann.dual(q, a, epsilon=1.0)))(alpha)
+  kl = boltzmann.kl_to_prior(boltzmann.importance_weights(q, alpha))
+  np.testing.assert_allclose(slope, 1.0 - kl, atol=1e-4)
+
+
+def test_weights_do_not_depend_on_a_shift_of_the_values():
+  q, alpha = random_q(3), jnp.full((8,), 0.05)
+  np.testing.assert_allclose(
+    boltzmann.importance_weights(q, alpha),
+    boltzmann.importance_weights(q + 3.0, alpha),
+    atol=1e-5,
+  )
+
+
+def test_hot_is_uniform_and_cold_is_the_best():
+  q = random_q(4)
+  hot = boltzmann.importance_weights(q, jnp.full((8,), 1e4))
+  np.testing.assert_allclose(hot, 1.0 / SAMPLES, rtol=1e-3)
+  np.testing.assert_allclose(boltzmann.kl_to_prior(hot), 0.0, atol=1e-5)
+  np.testing.assert_allclose(boltzmann.effective_sample_size(hot), SAMPLES, rtol=1e-3)
+  cold = boltzmann.importance_weights(q, jnp.full((8,), 1e-6))
+  np.testing.assert_array_equal(jnp.argmax(cold, 0), jnp.argmax(q, 0))
+  np.testing.assert_allclose(boltzmann.effective_sample_size(cold), 1.0, rtol=1e-3)
+  np.testing.assert_allclose(
+    boltzmann.kl_to_prior(cold), np.log(SAMPLES), rtol=1e-5
+  )
+
+
+def test_kl_never_passes_the_logarithm_of_the_samples():
+  for seed in range(5):
+    weights = boltzmann.importance_weights(random_q(seed), jnp.geomspace(1e-5, 9.0, 8))
+    kl = boltzmann.kl_to_prior(weights)
+    assert np.all(kl >= -1e-5)
+    assert np.all(kl <= np.log(SAMPLES) + 1e-5)
+
+
+def test_pick_follows_the_weights():
+  q, alpha = random_q(5, batch=2)[:6], jnp.array([0.2, 0.7])
+  draw = jax.vmap(lambda key: boltzmann.pick(key, q, alpha))
+  picked = np.asarray(draw(jax.random.split(jax.random.key(0), 40_000)))
+  weights = boltzmann.importance_weights(q, alpha)
+  for i in range(2):
+    shares = np.bincount(picked[:, i], minlength=6) / 40_000
+    np.testing.assert_allclose(shares, weights[:, i], atol=0.012)

@@ -1,0 +1,265 @@
+"""The agent: which loss trains what, optimisers, targets, determinism, learning."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from apnpql_jax.agents.algorithms import ALGORITHMS, get_algorithm
+from apnpql_jax.agents.learner import bellman_target, make_agent, total_loss
+from apnpql_jax.agents.networks import GROUPS
+from apnpql_jax.config import AgentConfig, ConfigError
+from apnpql_jax.types import Observation, Transition
+
+CONFIG = AgentConfig(
+  hidden=(32, 32),
+  feature_dim=32,
+  target_samples=16,
+  policy_samples=12,
+  learning_rate_e=4e-4,
+  learning_rate_m=3e-4,
+  learning_rate_alpha=2e-4,
+  learning_rate_nu=1e-4,
+  epsilon_nu=5.0,
+)
+BATCH = 16
+
+
+def random_batch(seed: int, batch: int = BATCH, *, pixels: bool = False) -> Transition:
+  rng = np.random.default_rng(seed)
+
+  def normal(*shape: int) -> jax.Array:
+    return jnp.asarray(rng.normal(size=shape), jnp.float32)
+
+  def image(height: int, width: int) -> jax.Array | None:
+    values = rng.integers(0, 256, (batch, height, width, 3))
+    return jnp.asarray(values, jnp.uint8) if pixels else None
+
+  def observation() -> Observation:
+    objects = None if pixels else normal(batch, 8)
+    return Observation(
+      robot=normal(batch, 21),
+      global_image=image(72, 96),
+      wrist_image=image(36, 64),
+      objects=objects,
+    )
+
+  gripper = jnp.asarray(rng.integers(0, 2, (batch, 1)), jnp.float32)
+  success = jnp.asarray(rng.random(batch) < 0.3, jnp.float32)
+  return Transition(
+    observation_tm1=observation(),
+    action_tm1=jnp.concatenate([jnp.tanh(normal(batch, 6)), gripper], axis=-1),
+    reward_t=success,
+    discount_t=0.97 * (1.0 - success),
+    observation_t=observation(),
+    primitives_tm1=jnp.tanh(normal(batch, 3, 6)),
+    weight=jnp.ones(batch),
+  )
+
+
+@pytest.fixture(scope="module")
+def agent():
+  return make_agent(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def state(agent):
+  return agent.init(jax.random.key(0), random_batch(0).observation_tm1)
+
+
+@pytest.fixture(scope="module")
+def update(agent):
+  with jax.numpy_rank_promotion("raise"):
+    compiled = jax.jit(agent.update)
+    example = agent.init(jax.random.key(0), random_batch(0).observation_tm1)
+    compiled(example, random_batch(0), jax.random.key(0))
+  return compiled
+
+
+TRAINS = {
+  "loss/q": {"encoder", "z"},
+  "loss/ap": {"encoder", "ap"},
+  "loss/m": {"bp"},
+  "loss/alpha": {"alpha"},
+  "loss/nu": {"nu"},
+}
+
+
+@pytest.mark.parametrize("name", TRAINS)
+def test_each_loss_trains_exactly_the_parameters_the_paper_names(agent, state, name):
+  batch, networks = random_batch(1), agent.networks
+  algorithm = get_algorithm("ap_npql")
+  target = bellman_target(
+    networks, algorithm, state.target_params, batch, jax.random.key(1)
+  )
+
+  def loss(trained):
+    key = jax.random.key(2)
+    return total_loss(networks, algorithm, trained, batch, target, key)[1][name]
+
+  grads = jax.grad(loss)({**state.params, "nu": jnp.float32(0.1)})
+  touched = {k for k, g in grads.items() if any(np.any(x) for x in jax.tree.leaves(g))}
+  assert touched == TRAINS[name]
+
+
+def test_total_loss_is_the_sum_of_the_losses(agent, state):
+  batch, algorithm = random_batch(1), get_algorithm("ap_npql")
+  target = jnp.full((BATCH, CONFIG.num_atoms), 1.0 / CONFIG.num_atoms)
+  total, metrics = total_loss(
+    agent.networks,
+    algorithm,
+    {**state.params, "nu": jnp.float32(0.1)},
+    batch,
+    target,
+    jax.random.key(2),
+  )
+  expected = sum(metrics[k] for k in TRAINS if k != "loss/ap")
+  expected += CONFIG.lambda_ap * metrics["loss/ap"]
+  assert total == pytest.approx(float(expected), rel=1e-5)
+
+
+def test_each_group_moves_at_its_own_learning_rate(state, update):
+  """The first step of Adam is as long as its learning rate."""
+  after, _ = update(state, random_batch(1), jax.random.key(0))
+  rates = {
+    "encoder": 4e-4,
+    "ap": 4e-4,
+    "z": 4e-4,
+    "bp": 3e-4,
+    "alpha": 2e-4,
+  }
+  for group in GROUPS:
+    moved = jax.tree.map(
+      lambda a, b: np.abs(a - b).max(), after.params[group], state.params[group]
+    )
+    largest = max(jax.tree.leaves(moved))
+    assert largest == pytest.approx(rates[group], rel=0.02), group
+  assert after.nu == pytest.approx(1e-4, rel=0.02)  # the entropy is below its floor
+  assert after.step == 1
+
+
+def test_target_network_is_the_moving_average_of_all_parameters(state, update):
+  after, _ = update(state, random_batch(1), jax.random.key(0))
+  expected = jax.tree.map(
+    lambda new, old: 0.05 * new + 0.95 * old, after.params, state.target_params
+  )
+  for a, b in zip(
+    jax.tree.leaves(after.target_params), jax.tree.leaves(expected), strict=True
+  ):
+    np.testing.assert_allclose(a, b, atol=1e-7)
+
+
+def test_nu_never_falls_below_zero(agent):
+  config = dataclasses.replace(CONFIG, epsilon_nu=-50.0)
+  agent = make_agent(config)
+  state = agent.init(jax.random.key(0), random_batch(0).observation_tm1)
+  after, metrics = jax.jit(agent.update)(state, random_batch(1), jax.random.key(0))
+  assert after.nu == 0.0
+  assert metrics["prior/entropy"] > -50.0
+
+
+def test_transitions_of_weight_zero_change_nothing(state, update):
+  batch = random_batch(2)
+  weight = batch.weight.at[5:].set(0.0)
+  garbage = random_batch(3)
+  other = jax.tree.map(lambda a, b: a.at[5:].set(b[5:]), batch, garbage)
+  one, _ = update(state, batch.replace(weight=weight), jax.random.key(0))
+  two, _ = update(state, other.replace(weight=weight), jax.random.key(0))
+  for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
+    np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
+  three, _ = update(state, other, jax.random.key(0))
+  assert not np.allclose(
+    one.params["ap"]["out"]["bias"], three.params["ap"]["out"]["bias"], atol=1e-6
+  )
+
+
+def test_update_is_deterministic_and_follows_its_key(state, update):
+  batch = random_batch(4)
+  first, again, other = (
+    jax.tree.leaves(update(state, batch, jax.random.key(k))) for k in (1, 1, 2)
+  )
+  assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+  assert not all(np.array_equal(a, b) for a, b in zip(first, other, strict=True))
+
+
+def test_losses_fall_on_a_fixed_batch(agent, state):
+  """Without bootstrap the targets are fixed, so they can be learnt by heart."""
+  batch = random_batch(5)
+  batch = batch.replace(discount_t=jnp.zeros(BATCH))
+
+  def body(state, key):
+    return agent.update(state, batch, key)
+
+  keys = jax.random.split(jax.random.key(0), 800)
+  _, metrics = jax.jit(lambda s: jax.lax.scan(body, s, keys))(state)
+  assert all(np.all(np.isfinite(v)) for v in metrics.values())
+  for name in ("loss/q", "loss/ap", "ap/error"):
+    first, last = metrics[name][:10].mean(), metrics[name][-10:].mean()
+    assert last < 0.3 * first, name
+  # The temperature follows its dual to where the KL limit holds.
+  assert metrics["npql/kl_over_eps"][-100:].mean() == pytest.approx(1.0, abs=0.25)
+
+
+def test_pixels_reach_the_value_and_are_trained():
+  agent = make_agent(CONFIG)
+  batch = random_batch(6, batch=4, pixels=True)
+  state = agent.init(jax.random.key(0), batch.observation_tm1)
+  after, metrics = jax.jit(agent.update)(state, batch, jax.random.key(0))
+  for camera in ("global_image", "wrist_image"):
+    before_kernel = state.params["encoder"][camera]["patches"]["kernel"]
+    after_kernel = after.params["encoder"][camera]["patches"]["kernel"]
+    assert np.any(before_kernel != after_kernel)
+  assert all(np.isfinite(v) for v in metrics.values())
+
+
+def test_actions_lie_in_the_action_box(agent, state):
+  params = jax.tree.map(lambda x: x, state.params)
+  params["ap"]["out"]["bias"] = jnp.linspace(-3.0, 3.0, 18)
+  actions, info = jax.jit(agent.act, static_argnums=3)(
+    params, random_batch(7).observation_tm1, jax.random.key(0), False
+  )
+  assert actions.shape == (BATCH, 7)
+  assert np.all(np.abs(actions) <= 1.0)
+  assert np.abs(actions[:, :6]).max() == 1.0
+  assert set(np.unique(actions[:, 6])) <= {0.0, 1.0}
+  assert all(v.shape == (BATCH,) for v in info.values())
+
+
+def test_greedy_takes_the_best_candidate(agent, state):
+  """Values are made to prefer a closed gripper and a fast first joint."""
+  params = jax.tree.map(lambda x: x, state.params)
+  z = {k: jax.tree.map(jnp.zeros_like, v) for k, v in params["z"].items()}
+  z["action"]["kernel"] = z["action"]["kernel"].at[0, 0].set(1.0).at[6, 0].set(5.0)
+  z["phi"]["bias"] = z["phi"]["bias"].at[0].set(10.0)
+  z["Dense_0"]["kernel"] = z["Dense_0"]["kernel"].at[0, 0].set(1.0)
+  z["out"]["kernel"] = z["out"]["kernel"].at[0].set(
+    0.2 * jnp.linspace(0.0, 1.0, CONFIG.num_atoms)
+  )
+  params["z"] = z
+  observation = random_batch(8).observation_tm1
+  act = jax.jit(agent.act, static_argnums=3)
+  keys = [jax.random.key(k) for k in range(30)]
+  greedy = [act(params, observation, k, True) for k in keys]
+  drawn = [act(params, observation, k, False) for k in keys]
+  for actions, info in greedy:
+    np.testing.assert_array_equal(info["q"], info["q_max"])
+    assert np.all(actions[:, 6] == 1.0)
+  mean_speed = [np.mean([a[:, 0] for a, _ in x]) for x in (greedy, drawn)]
+  assert mean_speed[0] > mean_speed[1]
+  assert any(np.any(info["q"] < info["q_max"]) for _, info in drawn)
+
+
+def test_limit_that_the_samples_cannot_reach_is_refused():
+  with pytest.raises(ConfigError, match="epsilon"):
+    make_agent(dataclasses.replace(CONFIG, epsilon=float(np.log(12)) + 1e-6))
+
+
+def test_unknown_algorithm_names_the_valid_ones():
+  with pytest.raises(ConfigError, match="ap_npql"):
+    make_agent(dataclasses.replace(CONFIG, algorithm="dqn"))
+  with pytest.raises(ConfigError, match=", ".join(ALGORITHMS)):
+    get_algorithm("dqn")
