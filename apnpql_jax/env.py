@@ -38,8 +38,7 @@ HELD_OUT_SHARE = 0.25
 Renderer = Callable[[Kinematics], Array]
 
 
-@struct.dataclass
-class EnvState:
+class EnvState(struct.PyTreeNode):
   """Everything the worlds need to go on."""
 
   physics: PhysicsState  # [worlds, ...]
@@ -72,11 +71,6 @@ class Env:
     )
 
   @property
-  def training_rows(self) -> Array:
-    """i32[2]: first and one past the last bank row that training may use."""
-    return jnp.array([0, self.bank_split])
-
-  @property
   def bank_split(self) -> int:
     """Rows from here on are held out for evaluation."""
     return int(self._bank.rows * (1 - HELD_OUT_SHARE))
@@ -92,17 +86,14 @@ class Env:
     Args:
       rows: i32[worlds].
     """
-    state = self._initial(rows)
     count = rows.shape[0]
-    arrival = EnvState(
-      physics=state,
-      targets=self._bank.targets[rows],
+    return self._arrive(
+      self._initial(rows),
+      self._bank.targets[rows],
       elapsed=jnp.zeros(count, jnp.int32),
-      timestep=None,
+      fresh=jnp.ones(count, bool),
+      history=jnp.zeros((count, HISTORY * 7)),
     )
-    fresh = jnp.ones(count, bool)
-    history = jnp.zeros((count, HISTORY * 7))
-    return self._arrive(arrival, fresh, history)
 
   def step(self, state: EnvState, action: Array, key: Array) -> EnvState:
     """One control period in every world.
@@ -116,13 +107,13 @@ class Env:
     moved = self.physics.step(state.physics, action[:, :6], action[:, 6])
     rows = jax.random.randint(key, reset.shape, 0, self.bank_split)
     merge = functools.partial(_where, reset)
-    arrival = EnvState(
-      physics=jax.tree.map(merge, self._initial(rows), moved),
-      targets=merge(self._bank.targets[rows], state.targets),
+    return self._arrive(
+      jax.tree.map(merge, self._initial(rows), moved),
+      merge(self._bank.targets[rows], state.targets),
       elapsed=jnp.where(reset, 0, state.elapsed + 1),
-      timestep=None,
+      fresh=reset,
+      history=state.timestep.observation.robot,
     )
-    return self._arrive(arrival, reset, state.timestep.observation.robot)
 
   def expert_action(self, state: EnvState) -> Array:
     """f32[worlds, 7]: what the task's scripted expert does now."""
@@ -139,22 +130,30 @@ class Env:
       self.task.scene, bank.qpos[rows], bank.mocap_pos[rows], bank.mocap_quat[rows]
     )
 
-  def _arrive(self, state: EnvState, fresh: Array, history: Array) -> EnvState:
+  def _arrive(
+    self,
+    state: PhysicsState,
+    targets: Array,
+    *,
+    elapsed: Array,
+    fresh: Array,
+    history: Array,
+  ) -> EnvState:
     """Judges, labels and observes the instant the worlds have come to."""
-    kinematics = self._kinematics(state.physics)
-    poses = self.task.tool_targets(state.physics, kinematics)
-    targets = tracking.refine(self._chain, state.targets, *poses)
-    q = state.physics.qpos[:, self.task.scene.arm_qpos]
-    solved = self.task.success(state.physics, kinematics) & ~fresh
-    late = (state.elapsed >= self.config.episode_steps) & ~fresh
+    kinematics = self._kinematics(state)
+    poses = self.task.tool_targets(state, kinematics)
+    targets = tracking.refine(self._chain, targets, *poses)
+    q = state.qpos[:, self.task.scene.arm_qpos]
+    solved = self.task.success(state, kinematics) & ~fresh
+    late = (elapsed >= self.config.episode_steps) & ~fresh
     timestep = TimeStep(
-      observation=self._observe(state.physics, kinematics, fresh, history),
+      observation=self._observe(state, kinematics, fresh, history),
       reward=solved.astype(jnp.float32),
       terminated=solved,
       truncated=late & ~solved,
       primitives=tracking.follow(targets, q[:, None]),
     )
-    return state.replace(targets=targets, timestep=timestep)
+    return EnvState(state, targets, elapsed, timestep)
 
   def _observe(self, state, kinematics, fresh, history) -> Observation:
     scene = self.task.scene

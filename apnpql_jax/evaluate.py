@@ -27,8 +27,7 @@ MAX_WORLDS = 64
 """Episodes played at once; more are played in turn."""
 
 
-@struct.dataclass
-class Episodes:
+class Episodes(struct.PyTreeNode):
   """Outcome of one episode per world."""
 
   success: Array  # bool[worlds]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import functools
+from typing import Any
 
 from flax import struct
 import jax
@@ -18,8 +19,7 @@ from apnpql_jax.rollout import agent_policy, expert_policy, rollout
 from apnpql_jax.types import ACTION_DIM, Array, Metrics
 
 
-@struct.dataclass
-class TrainState:
+class TrainState(struct.PyTreeNode):
   """Everything needed to go on."""
 
   learner: LearnerState
@@ -101,7 +101,7 @@ def initial_state(config: TrainConfig, env: Env, agent: Agent) -> TrainState:
 
 def example_slot(worlds: EnvState) -> Slot:
   """Shapes and dtypes of one replay slot of one world."""
-  action = jax.ShapeDtypeStruct((ACTION_DIM,), jnp.float32)
+  action: Any = jax.ShapeDtypeStruct((ACTION_DIM,), jnp.float32)
   timestep = jax.tree.map(
     lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), worlds.timestep
   )

@@ -22,16 +22,14 @@ _CANDIDATES = 4
 """Starts drawn per row; those where an episode ended (1 in 20 to 94) are refused."""
 
 
-@struct.dataclass
-class Slot:
+class Slot(struct.PyTreeNode):
   """One instant of one world and what was done there."""
 
   timestep: TimeStep  # [*b, ...]
   action: Array  # f32[*b, 7]: action_t; ignored where the step is last
 
 
-@struct.dataclass
-class Replay:
+class Replay(struct.PyTreeNode):
   """Ring buffer of fixed size; every leaf keeps the dtype of its slot."""
 
   slots: Slot  # [length, worlds, ...]

@@ -24,8 +24,7 @@ NUM_PRIMITIVES = 3
 """Target object, desired goal, neutral configuration (paper Sec. V-A)."""
 
 
-@struct.dataclass
-class Observation:
+class Observation(struct.PyTreeNode):
   """What the agent sees (paper Sec. V-A). Absent modalities are ``None``."""
 
   robot: Array  # f32[*b, 21]: last three (6 joint, gripper angle), newest last, rad
@@ -35,8 +34,7 @@ class Observation:
   objects: Array | None = None  # f32[*b, n]: positions, m, only under --obs state
 
 
-@struct.dataclass
-class TimeStep:
+class TimeStep(struct.PyTreeNode):
   """One instant of one world. Terminal instants are kept; the next one is a reset."""
 
   observation: Observation  # [*b, ...]
@@ -51,8 +49,7 @@ class TimeStep:
     return self.terminated | self.truncated
 
 
-@struct.dataclass
-class Transition:
+class Transition(struct.PyTreeNode):
   """An N-step transition as the learner consumes it."""
 
   observation_tm1: Observation  # [B, ...]

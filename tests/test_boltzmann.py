@@ -29,9 +29,7 @@ def test_weights_and_dual_match_rlax():
   )
   ours = boltzmann.dual(q, alpha, epsilon=1.5)
   np.testing.assert_allclose(ours, expected, rtol=1e-5, atol=1e-6)
-  np.testing.assert_allclose(
-    boltzmann.importance_weights(q, alpha), weights, atol=1e-6
-  )
+  np.testing.assert_allclose(boltzmann.importance_weights(q, alpha), weights, atol=1e-6)
 
 
 @pytest.mark.parametrize("epsilon", [0.2, 1.0, 2.5])
@@ -79,9 +77,7 @@ def test_hot_is_uniform_and_cold_is_the_best():
   cold = boltzmann.importance_weights(q, jnp.full((8,), 1e-6))
   np.testing.assert_array_equal(jnp.argmax(cold, 0), jnp.argmax(q, 0))
   np.testing.assert_allclose(boltzmann.effective_sample_size(cold), 1.0, rtol=1e-3)
-  np.testing.assert_allclose(
-    boltzmann.kl_to_prior(cold), np.log(SAMPLES), rtol=1e-5
-  )
+  np.testing.assert_allclose(boltzmann.kl_to_prior(cold), np.log(SAMPLES), rtol=1e-5)
 
 
 def test_kl_never_passes_the_logarithm_of_the_samples():

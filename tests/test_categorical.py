@@ -114,7 +114,9 @@ def test_broadest_logits_have_the_mean_and_the_largest_entropy(expected: float):
   constraints = np.stack([np.ones_like(atoms), atoms]) * np.sqrt(probs)
   for _ in range(20):
     change = rng.normal(size=atoms.shape)
-    change -= constraints.T @ np.linalg.solve(constraints @ constraints.T, constraints @ change)
+    change -= constraints.T @ np.linalg.solve(
+      constraints @ constraints.T, constraints @ change
+    )
     other = probs + 0.1 * change * np.sqrt(probs) * np.sqrt(probs.min())
     assert np.all(other > 0.0)
     assert entropy(other) < entropy(probs) + 1e-9

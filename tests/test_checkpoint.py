@@ -22,8 +22,7 @@ from apnpql_jax.config import AgentConfig, ConfigError, TrainConfig
 CONFIG = TrainConfig()
 
 
-@struct.dataclass
-class State:
+class State(struct.PyTreeNode):
   """One leaf of every kind a training state has."""
 
   params: dict[str, jax.Array]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import distrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -58,10 +61,10 @@ def test_log_prob_matches_scipy_for_every_batch_element():
     np.testing.assert_allclose(ours[(slice(None), *i)], expected, rtol=1e-4, atol=1e-4)
 
 
-def test_log_prob_gradient_matches_finite_differences_of_scipy():
-  mixture = random_gmm(3, dim=2)
-  actions = np.asarray(gmm.sample(jax.random.key(0), mixture, 20))
-  grads = jax.grad(lambda m: jnp.sum(gmm.log_prob(m, jnp.asarray(actions))))(mixture)
+def assert_gradient(
+  grads: GripperGMM, mixture: GripperGMM, function: Callable[[GripperGMM], float]
+) -> None:
+  """Compares with central differences of a function in double precision."""
   h = 1e-4
   for name in ("logits", "mean", "scale_tril", "gripper_logits"):
     value = np.asarray(getattr(mixture, name), np.float64)
@@ -72,10 +75,30 @@ def test_log_prob_gradient_matches_finite_differences_of_scipy():
       for sign in (1.0, -1.0):
         moved = value.copy()
         moved[i] += sign * h
-        ends.append(scipy_log_prob(mixture.replace(**{name: moved}), actions).sum())
+        ends.append(function(mixture.replace(**{name: moved})))
       expected = (ends[0] - ends[1]) / (2.0 * h)
       actual = float(getattr(grads, name)[i])
       assert actual == pytest.approx(expected, rel=2e-3, abs=2e-3), (name, i)
+
+
+def test_log_prob_gradient_matches_finite_differences_of_scipy():
+  mixture = random_gmm(3, dim=2)
+  actions = np.asarray(gmm.sample(jax.random.key(0), mixture, 20))
+  grads = jax.grad(lambda m: jnp.sum(gmm.log_prob(m, jnp.asarray(actions))))(mixture)
+  assert_gradient(grads, mixture, lambda m: scipy_log_prob(m, actions).sum())
+
+
+def test_log_prob_matches_distrax_where_the_gripper_is_a_coin():
+  mixture = random_gmm(5, batch=(4,)).replace(gripper_logits=jnp.zeros((4, 3)))
+  actions = gmm.sample(jax.random.key(3), mixture, 30)
+  arm = distrax.MixtureSameFamily(
+    distrax.Categorical(logits=mixture.logits),
+    distrax.MultivariateNormalTri(mixture.mean, mixture.scale_tril),
+  )
+  expected = arm.log_prob(actions[..., :6]) - np.log(2.0)
+  np.testing.assert_allclose(
+    gmm.log_prob(mixture, actions), expected, rtol=1e-4, atol=1e-4
+  )
 
 
 def test_samples_have_the_moments_of_the_mixture():
@@ -86,7 +109,9 @@ def test_samples_have_the_moments_of_the_mixture():
   scale = np.asarray(mixture.scale_tril)
   mean = weights @ means
   second = np.einsum(
-    "k,kij->ij", weights, scale @ scale.swapaxes(-1, -2) + means[:, :, None] * means[:, None]
+    "k,kij->ij",
+    weights,
+    scale @ scale.swapaxes(-1, -2) + means[:, :, None] * means[:, None],
   )
   arm = actions[:, :6]
   np.testing.assert_allclose(arm.mean(0), mean, atol=0.02)
@@ -158,25 +183,43 @@ def test_entropy_bound_in_six_dimensions_against_monte_carlo():
   assert bound >= surprise.mean() - 0.7
 
 
-def test_bhattacharyya_coefficients_match_the_closed_form():
-  mixture = random_gmm(2)
-  covariance = np.einsum("kij,klj->kil", mixture.scale_tril, mixture.scale_tril)
+def numpy_bound(mixture: GripperGMM) -> float:
+  """The pairwise bound written out in double precision."""
+  scale = np.asarray(mixture.scale_tril, np.float64)
+  covariance = scale @ scale.swapaxes(-1, -2)
+  weights = special.softmax(np.asarray(mixture.logits, np.float64))
   probability = special.expit(np.asarray(mixture.gripper_logits, np.float64))
-  expected = np.zeros((3, 3))
-  for i in range(3):
-    for j in range(3):
+  total = 0.0
+  for i, weight in enumerate(weights):
+    overlaps = []
+    for j in range(len(weights)):
       middle = 0.5 * (covariance[i] + covariance[j])
-      d = np.asarray(mixture.mean[i] - mixture.mean[j])
-      log_dets = [np.linalg.slogdet(c)[1] for c in (middle, covariance[i], covariance[j])]
-      expected[i, j] = -0.125 * d @ np.linalg.solve(middle, d) - 0.5 * log_dets[0]
-      expected[i, j] += 0.25 * (log_dets[1] + log_dets[2])
-      expected[i, j] += np.log(
-        np.sqrt(probability[i] * probability[j])
-        + np.sqrt((1.0 - probability[i]) * (1.0 - probability[j]))
-      )
-  np.testing.assert_allclose(
-    gmm._log_bhattacharyya(mixture), expected, rtol=1e-4, atol=1e-4
-  )
+      d = np.asarray(mixture.mean[i] - mixture.mean[j], np.float64)
+      dets = [np.linalg.det(c) for c in (covariance[i], covariance[j], middle)]
+      arm = (dets[0] * dets[1]) ** 0.25 / np.sqrt(dets[2])
+      arm *= np.exp(-0.125 * d @ np.linalg.solve(middle, d))
+      gripper = np.sqrt(probability[i] * probability[j])
+      gripper += np.sqrt((1.0 - probability[i]) * (1.0 - probability[j]))
+      overlaps.append(arm * gripper)
+    own = stats.multivariate_normal(cov=covariance[i]).entropy()
+    own += stats.bernoulli(probability[i]).entropy()
+    total += weight * (own - np.log(weights @ np.array(overlaps)))
+  return float(total)
+
+
+def test_entropy_bound_and_its_gradient_match_the_formula_in_double_precision():
+  mixture = random_gmm(2, dim=3, spread=0.5)
+  value, grads = jax.value_and_grad(gmm.entropy_bound)(mixture)
+  assert value == pytest.approx(numpy_bound(mixture), abs=1e-4)
+  assert_gradient(grads, mixture, numpy_bound)
+
+
+def test_entropy_bound_of_a_batch_is_that_of_its_elements():
+  mixture = random_gmm(8, batch=(2, 3))
+  ours = jax.jit(gmm.entropy_bound)(mixture)
+  for i in np.ndindex(2, 3):
+    one = jax.tree.map(lambda x, i=i: x[i], mixture)
+    assert ours[i] == pytest.approx(numpy_bound(one), abs=1e-3)
 
 
 def test_entropy_and_density_stay_finite_where_the_gripper_is_certain():

@@ -204,16 +204,18 @@ def test_losses_fall_on_a_fixed_batch(agent, state):
   assert metrics["npql/kl_over_eps"][-100:].mean() == pytest.approx(1.0, abs=0.25)
 
 
-def test_pixels_reach_the_value_and_are_trained():
-  agent = make_agent(CONFIG)
-  batch = random_batch(6, batch=4, pixels=True)
-  state = agent.init(jax.random.key(0), batch.observation_tm1)
-  after, metrics = jax.jit(agent.update)(state, batch, jax.random.key(0))
-  for camera in ("global_image", "wrist_image"):
-    before_kernel = state.params["encoder"][camera]["patches"]["kernel"]
-    after_kernel = after.params["encoder"][camera]["patches"]["kernel"]
-    assert np.any(before_kernel != after_kernel)
-  assert all(np.isfinite(v) for v in metrics.values())
+@pytest.mark.parametrize("camera", ["global_image", "wrist_image"])
+def test_both_cameras_are_trained_by_the_value(agent, camera: str):
+  batch = random_batch(6, batch=2, pixels=True)
+  networks = agent.networks
+  params = networks.init(jax.random.key(0), batch.observation_tm1)
+
+  def values(params):
+    phi = networks.features(params, batch.observation_tm1)
+    return jnp.sum(networks.q_logits(params, phi, batch.action_tm1[None])[..., 0])
+
+  grads = jax.jit(jax.grad(values))(params)["encoder"][camera]
+  assert all(np.any(g) for g in jax.tree.leaves(grads))
 
 
 def test_actions_lie_in_the_action_box(agent, state):
@@ -236,8 +238,8 @@ def test_greedy_takes_the_best_candidate(agent, state):
   z["action"]["kernel"] = z["action"]["kernel"].at[0, 0].set(1.0).at[6, 0].set(5.0)
   z["phi"]["bias"] = z["phi"]["bias"].at[0].set(10.0)
   z["Dense_0"]["kernel"] = z["Dense_0"]["kernel"].at[0, 0].set(1.0)
-  z["out"]["kernel"] = z["out"]["kernel"].at[0].set(
-    0.2 * jnp.linspace(0.0, 1.0, CONFIG.num_atoms)
+  z["out"]["kernel"] = (
+    z["out"]["kernel"].at[0].set(0.2 * jnp.linspace(0.0, 1.0, CONFIG.num_atoms))
   )
   params["z"] = z
   observation = random_batch(8).observation_tm1

@@ -83,7 +83,9 @@ def test_robot_inputs_hold_the_newest_state_and_the_changes():
   np.testing.assert_allclose(inputs[26:], 7.0 * 0.3, rtol=1e-5)
 
 
-@pytest.mark.parametrize("pixels, objects", [(True, False), (False, True), (True, True)])
+@pytest.mark.parametrize(
+  "pixels, objects", [(True, False), (False, True), (True, True)]
+)
 def test_outputs_have_the_declared_shapes(pixels: bool, objects: bool):
   networks = make_networks(CONFIG)
   seen = observation(4, pixels=pixels, objects=objects)
@@ -115,9 +117,13 @@ def test_value_head_is_a_plain_network_of_features_and_action():
   rng = np.random.default_rng(2)
   phi = jnp.asarray(rng.normal(size=(3, 20)), jnp.float32)
   actions = jnp.asarray(rng.uniform(-1.0, 1.0, (5, 3, 7)), jnp.float32)
-  actions = actions.at[..., -1].set(jnp.asarray(rng.integers(0, 2, (5, 3)), jnp.float32))
+  actions = actions.at[..., -1].set(
+    jnp.asarray(rng.integers(0, 2, (5, 3)), jnp.float32)
+  )
   z = jax.tree.map(lambda x: np.asarray(x, np.float64), params["z"])
-  centred = np.asarray(actions) * np.array([1.0] * 6 + [2.0]) - np.array([0.0] * 6 + [1.0])
+  centred = np.asarray(actions) * np.array([1.0] * 6 + [2.0]) - np.array(
+    [0.0] * 6 + [1.0]
+  )
   both = np.concatenate([np.broadcast_to(phi, (5, 3, 20)), centred], axis=-1)
   kernel = np.concatenate([z["phi"]["kernel"], z["action"]["kernel"]])
   x = np.maximum(both @ kernel + z["phi"]["bias"], 0.0)
@@ -154,7 +160,9 @@ def test_prior_keeps_its_floors_and_limits():
   assert diagonal.max() == pytest.approx(0.5, abs=1e-4)
   assert not np.any(np.triu(scale, k=1))
   assert np.abs(scale).max() <= 0.5 + 1e-6
-  assert np.all(np.abs(scale[:, :, np.tril_indices(6, -1)[0], np.tril_indices(6, -1)[1]]) > 0.0)
+  assert np.all(
+    np.abs(scale[:, :, np.tril_indices(6, -1)[0], np.tril_indices(6, -1)[1]]) > 0.0
+  )
   weights = jax.nn.softmax(prior.logits)
   np.testing.assert_allclose(jnp.sum(jnp.exp(prior.logits), -1), 1.0, atol=1e-5)
   assert weights.min() == pytest.approx(0.05, abs=1e-3)

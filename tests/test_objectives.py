@@ -89,9 +89,7 @@ def test_q_loss_with_one_candidate_is_the_td_loss_of_rlax():
   target = objectives.value_target(
     logits_t[None], jnp.ones((1, 8)), reward, discount, ATOMS
   )
-  np.testing.assert_allclose(
-    objectives.q_loss(logits_tm1, target), expected, rtol=1e-4
-  )
+  np.testing.assert_allclose(objectives.q_loss(logits_tm1, target), expected, rtol=1e-4)
 
 
 def test_alpha_descends_to_where_the_limit_holds():

@@ -48,7 +48,7 @@ def test_refinement_agrees_with_mink(task, small_bank):
   moved = position + jnp.asarray(shift, jnp.float32)
   refined = jax.jit(tracking.refine)(chain, target, moved, rotation)
   for i in range(16):
-    exact = solver.solve(np.asarray(target[i]), moved[i], np.asarray(rotation[i]))
+    exact = solver.solve(*(np.asarray(x[i]) for x in (target, moved, rotation)))
     assert exact.reached
     np.testing.assert_allclose(refined[i], exact.q, atol=2e-3)
 

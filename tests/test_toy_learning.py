@@ -8,7 +8,6 @@ the object, the goal and a neutral place. A quarter of each batch is an expert's
 from __future__ import annotations
 
 from collections.abc import Callable
-import functools
 
 from flax import struct
 import jax
@@ -36,8 +35,7 @@ CONFIG = AgentConfig(
 AGENT = make_agent(CONFIG)
 
 
-@struct.dataclass
-class World:
+class World(struct.PyTreeNode):
   history: Array  # f32[W, 3, 7]: last positions and gripper, newest last
   places: Array  # f32[W, 3, 6]: object, goal, neutral
   holding: Array  # bool[W]

@@ -19,8 +19,7 @@ from apnpql_jax.dists import boltzmann, categorical, gmm
 from apnpql_jax.types import Array, Metrics, Observation, Transition
 
 
-@struct.dataclass
-class LearnerState:
+class LearnerState(struct.PyTreeNode):
   """All that the learner needs to go on."""
 
   params: Params  # one entry per name in GROUPS
@@ -45,9 +44,7 @@ class Agent:
   Candidates come from the prior; one is drawn in proportion to exp(Q / alpha), or,
   if greedy (a Python bool), the best is taken."""
 
-  update: Callable[
-    [LearnerState, Transition, Array], tuple[LearnerState, Metrics]
-  ]
+  update: Callable[[LearnerState, Transition, Array], tuple[LearnerState, Metrics]]
   """(state, transitions [B], key) -> state after one update, metrics f32[]."""
 
 
@@ -89,9 +86,9 @@ def make_agent(config: AgentConfig) -> Agent:
       networks, algorithm, trained, batch, target, key_tm1
     )
     steps, opt_state = optimiser.update(grads, state.opt_state, trained)
-    params = optax.apply_updates(trained, steps)
+    params: Params = dict(optax.apply_updates(trained, steps))
     nu = jnp.maximum(params.pop("nu"), 0.0)
-    metrics |= {f"grad_norm/{k}": optax.global_norm(grads[k]) for k in GROUPS}
+    metrics |= {f"grad_norm/{k}": optax.tree.norm(grads[k]) for k in GROUPS}
     metrics["prior/nu"] = nu
     target_params = optax.incremental_update(
       params, state.target_params, config.target_rate
@@ -218,9 +215,7 @@ def total_loss(
     "loss/m": algorithm.regulariser_update(
       prior, candidates.samples, weights, trained["nu"]
     ),
-    "loss/nu": objectives.nu_loss(
-      trained["nu"], entropy, epsilon_nu=config.epsilon_nu
-    ),
+    "loss/nu": objectives.nu_loss(trained["nu"], entropy, epsilon_nu=config.epsilon_nu),
     "ap/error": jnp.mean(jnp.abs(predicted - batch.primitives_tm1), axis=(-2, -1)),
     "npql/kl_over_eps": boltzmann.kl_to_prior(weights) / config.epsilon,
     "npql/ess": boltzmann.effective_sample_size(weights),
@@ -231,9 +226,7 @@ def total_loss(
     "q/data": categorical.mean(jax.nn.softmax(logits), networks.atoms),
     "q/target": categorical.mean(target, networks.atoms),
   }
-  metrics = {
-    k: objectives.weighted_mean(v, batch.weight) for k, v in per_state.items()
-  }
+  metrics = {k: objectives.weighted_mean(v, batch.weight) for k, v in per_state.items()}
   total = config.lambda_ap * metrics["loss/ap"] + sum(
     metrics[k] for k in ("loss/q", "loss/alpha", "loss/m", "loss/nu")
   )

@@ -90,7 +90,7 @@ class Networks:
     keys = dict(zip(GROUPS, jax.random.split(key, len(GROUPS)), strict=True))
     batch = observation.robot.shape[:-1]
     phi = jnp.zeros((*batch, self.config.feature_dim))
-    inputs = dict.fromkeys(GROUPS, (phi,))
+    inputs: dict[str, tuple[Any, ...]] = dict.fromkeys(GROUPS, (phi,))
     inputs["encoder"] = (observation,)
     inputs["z"] = (phi, jnp.zeros((1, *batch, ARM_DOF + 1)))
     return {k: self.modules[k].init(keys[k], *inputs[k])["params"] for k in GROUPS}
@@ -135,7 +135,7 @@ class Networks:
     offset = _inverse_softplus(self.config.initial_alpha)
     return jax.nn.softplus(raw + offset) + self.config.min_alpha
 
-  def _apply(self, group: str, params: Params, *inputs: Any) -> Array:
+  def _apply(self, group: str, params: Params, *inputs: Any) -> Any:
     return self.modules[group].apply({"params": params[group]}, *inputs)
 
 

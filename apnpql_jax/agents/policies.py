@@ -11,8 +11,7 @@ from apnpql_jax.dists import boltzmann, categorical, gmm
 from apnpql_jax.types import Array
 
 
-@struct.dataclass
-class Candidates:
+class Candidates(struct.PyTreeNode):
   """S candidate actions per state and the policy's weights on them. No gradients."""
 
   samples: Array  # f32[S, *b, 7]: as drawn, where log b is evaluated

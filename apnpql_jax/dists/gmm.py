@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 
-import distrax
 from flax import struct
 import jax
 import jax.numpy as jnp
@@ -22,8 +21,7 @@ Array = jax.Array
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
-@struct.dataclass
-class GripperGMM:
+class GripperGMM(struct.PyTreeNode):
   """Mixture of K components over (D continuous dimensions, one binary gripper).
 
   An action is ``f32[D + 1]``, the gripper in {0, 1} last. ``*b`` are batch axes.
@@ -46,17 +44,19 @@ def sample(key: Array, gmm: GripperGMM, num: int) -> Array:
   Returns:
     f32[S, *b, D + 1].
   """
-  key_component, key_arm, key_gripper = jax.random.split(key, 3)
-  batch, dim = gmm.mean.shape[:-2], gmm.mean.shape[-1]
-  component = distrax.OneHotCategorical(logits=gmm.logits, dtype=gmm.mean.dtype)
-  chosen = component.sample(seed=key_component, sample_shape=(num,))
-  noise = jax.random.normal(key_arm, (num, *batch, dim), gmm.mean.dtype)
+  key_arm, key_choice = jax.random.split(key)
+  batch, dim, dtype = gmm.mean.shape[:-2], gmm.mean.shape[-1], gmm.mean.dtype
+  noise = jax.random.normal(key_arm, (num, *batch, dim), dtype)
+  choice = jax.random.uniform(key_choice, (2, num, *batch), dtype)
+  above = jnp.cumsum(jax.nn.softmax(gmm.logits), axis=-1)
+  component = jnp.sum(choice[0, ..., None] >= above[None, ..., :-1], axis=-1)
+  chosen = jax.nn.one_hot(component, gmm.logits.shape[-1], dtype=dtype)
   # Moving each draw by every component and then choosing beats gathering a 6x6
   # factor per draw: K is small, and this is one batched matrix product.
   arm = jnp.einsum("...kij,s...j->s...ki", gmm.scale_tril, noise) + gmm.mean[None]
   arm = jnp.sum(chosen[..., None] * arm, axis=-2)
   probability = jnp.sum(chosen * jax.nn.sigmoid(gmm.gripper_logits)[None], axis=-1)
-  gripper = jax.random.bernoulli(key_gripper, probability).astype(arm.dtype)
+  gripper = (choice[1] < probability).astype(dtype)
   return jnp.concatenate([arm, gripper[..., None]], axis=-1)
 
 
@@ -73,7 +73,7 @@ def log_prob(gmm: GripperGMM, actions: Array) -> Array:
   arm, gripper = actions[..., :-1], actions[..., -1]
   dim = arm.shape[-1]
   # The factor is inverted once per component, not solved once per sample.
-  whitener = _solve_lower(gmm.scale_tril, jnp.eye(dim, dtype=arm.dtype))
+  whitener = _invert_lower(gmm.scale_tril)
   difference = arm[..., None, :] - gmm.mean[None]
   white = jnp.einsum("...kij,s...kj->s...ki", whitener, difference)
   constant = -_half_log_det(gmm.scale_tril) - 0.5 * dim * _LOG_2PI
@@ -115,17 +115,11 @@ def _log_bhattacharyya(gmm: GripperGMM) -> Array:
   rows, columns = jnp.triu_indices(num, k=1)
   scale = gmm.scale_tril
   covariance = scale @ jnp.swapaxes(scale, -1, -2)
-  middle = _cholesky(
-    0.5 * (covariance[..., rows, :, :] + covariance[..., columns, :, :])
-  )
+  middle = 0.5 * (covariance[..., rows, :, :] + covariance[..., columns, :, :])
   difference = gmm.mean[..., rows, :] - gmm.mean[..., columns, :]
-  white = _solve_lower(middle, difference[..., None])[..., 0]
   half_log_det = _half_log_det(scale)
-  gaussian = (
-    0.5 * (half_log_det[..., rows] + half_log_det[..., columns])
-    - _half_log_det(middle)
-    - 0.125 * jnp.sum(jnp.square(white), axis=-1)
-  )
+  gaussian = 0.5 * (half_log_det[..., rows] + half_log_det[..., columns])
+  gaussian = gaussian + _log_overlap(middle, difference)
   one, zero = (jax.nn.log_sigmoid(s * gmm.gripper_logits) for s in (1.0, -1.0))
   bernoulli = jnp.logaddexp(
     0.5 * (one[..., rows] + one[..., columns]),
@@ -142,35 +136,64 @@ def _half_log_det(scale_tril: Array) -> Array:
   return jnp.sum(jnp.log(diagonal), axis=-1)
 
 
-def _solve_lower(lower: Array, rhs: Array) -> Array:
-  """X of L X = B by forward substitution, one row of X at a time.
-
-  Args:
-    lower: f32[*b, D, D], lower triangular.
-    rhs: f32[*b, D, M], or f32[D, M] for the same right-hand side everywhere.
-
-  Returns:
-    f32[*b, D, M].
-  """
-  rhs = jnp.broadcast_to(rhs, lower.shape[:-1] + rhs.shape[-1:])
+def _invert_lower(lower: Array) -> Array:
+  """Inverse of lower-triangular f32[*b, D, D] by forward substitution, row by row."""
+  identity = jnp.eye(lower.shape[-1], dtype=lower.dtype)
   rows: list[Array] = []
   for i in range(lower.shape[-1]):
-    row = rhs[..., i, :]
+    row = jnp.broadcast_to(identity[i], lower.shape[:-1])
     for j, known in enumerate(rows):
       row = row - lower[..., i, j, None] * known
     rows.append(row / lower[..., i, i, None])
   return jnp.stack(rows, axis=-2)
 
 
-def _cholesky(matrix: Array) -> Array:
-  """Lower Cholesky factor of f32[*b, D, D], one column at a time."""
-  dim = matrix.shape[-1]
-  columns: list[Array] = []
-  for j in range(dim):
-    column = matrix[..., :, j]
-    for known in columns:
-      column = column - known * known[..., j, None]
-    below = (jnp.arange(dim) >= j).astype(matrix.dtype)
-    below = jnp.broadcast_to(below, column.shape)
-    columns.append(below * column / jnp.sqrt(column[..., j, None]))
-  return jnp.stack(columns, axis=-1)
+@jax.custom_vjp
+def _log_overlap(matrix: Array, difference: Array) -> Array:
+  """-log(det M) / 2 - d^T M^-1 d / 8 for positive definite M: f32[*b].
+
+  The gradient is written out, as it needs nothing but the inverse.
+
+  Args:
+    matrix: f32[*b, D, D].
+    difference: f32[*b, D].
+  """
+  return _log_overlap_forward(matrix, difference)[0]
+
+
+def _log_overlap_forward(
+  matrix: Array, difference: Array
+) -> tuple[Array, tuple[Array, Array]]:
+  inverse, log_det = _invert(matrix)
+  solved = jnp.sum(inverse * difference[..., None, :], axis=-1)
+  distance = jnp.sum(difference * solved, axis=-1)
+  return -0.5 * log_det - 0.125 * distance, (inverse, solved)
+
+
+def _log_overlap_backward(
+  saved: tuple[Array, Array], cotangent: Array
+) -> tuple[Array, Array]:
+  inverse, solved = saved
+  outer = solved[..., :, None] * solved[..., None, :]
+  to_matrix = 0.125 * outer - 0.5 * inverse
+  return cotangent[..., None, None] * to_matrix, cotangent[..., None] * -0.25 * solved
+
+
+_log_overlap.defvjp(_log_overlap_forward, _log_overlap_backward)
+
+
+def _invert(matrix: Array) -> tuple[Array, Array]:
+  """Inverse and log determinant of positive definite f32[*b, D, D].
+
+  Sweeps one row and column after the other (Gauss-Jordan without pivoting, which
+  positive definite matrices do not need); the pivots multiply to the determinant.
+  """
+  log_det = jnp.zeros(matrix.shape[:-2], matrix.dtype)
+  for k in range(matrix.shape[-1]):
+    pivot = matrix[..., k, k]
+    row = matrix[..., k, :] / pivot[..., None]
+    matrix = matrix - matrix[..., :, k, None] * row[..., None, :]
+    matrix = matrix.at[..., k, :].set(row).at[..., :, k].set(row)
+    matrix = matrix.at[..., k, k].set(-1.0 / pivot)
+    log_det = log_det + jnp.log(pivot)
+  return -matrix, log_det

@@ -9,12 +9,13 @@ from __future__ import annotations
 import concurrent.futures
 import dataclasses
 import hashlib
+import inspect
 import json
 import multiprocessing
 import os
 import pathlib
 import tempfile
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from flax import struct
 import jax
@@ -44,8 +45,7 @@ SETTLE_SPEED = 0.05
 """m/s and rad/s; above float32 contact noise (0.04)."""
 
 
-@struct.dataclass
-class ResetBank:
+class ResetBank(struct.PyTreeNode):
   """Settled initial states and where their primitives lead."""
 
   qpos: Array  # f32[rows, nq]
@@ -170,15 +170,16 @@ def _cache_path(task: Task, rows: int) -> pathlib.Path:
 
 def _source(task: Task) -> str:
   """The task's own file: its ranges and tool targets decide what a bank holds."""
-  module = type(task).__module__
-  path = pathlib.Path(__import__(module, fromlist=["_"]).__file__)
+  path = pathlib.Path(inspect.getfile(type(task)))
   return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _store(path: pathlib.Path, bank: ResetBank, report: BankReport) -> None:
   """Writes atomically, so that two runs at once never see half a file."""
   path.parent.mkdir(parents=True, exist_ok=True)
-  arrays = {f: np.asarray(getattr(bank, f)) for f in ResetBank.__dataclass_fields__}
+  arrays: dict[str, Any] = {
+    f: np.asarray(getattr(bank, f)) for f in ResetBank.__dataclass_fields__
+  }
   with tempfile.NamedTemporaryFile(
     dir=path.parent, suffix=".npz", delete=False
   ) as file:

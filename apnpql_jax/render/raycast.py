@@ -34,8 +34,7 @@ BLOCKS = 4
 _FULL = 255.0 / 256.0  # full intensity; below one, for the integer part is the colour
 
 
-@struct.dataclass
-class Image:
+class Image(struct.PyTreeNode):
   """What a camera sees; ``None`` where it was not asked for."""
 
   rgb: Array | None = None  # u8[*b, H, W, 3]

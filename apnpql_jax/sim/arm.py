@@ -11,8 +11,7 @@ from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import ARM_DOF, Array
 
 
-@struct.dataclass
-class ArmChain:
+class ArmChain(struct.PyTreeNode):
   """The serial chain from the world to the tool site, lengths in m."""
 
   base_pos: Array  # f32[3]: parent of the first link in the world

@@ -14,8 +14,7 @@ from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
 
 
-@struct.dataclass
-class Kinematics:
+class Kinematics(struct.PyTreeNode):
   """World poses of what can be seen or measured, by MuJoCo id."""
 
   geom_xpos: Array  # f32[*b, ngeom, 3]
@@ -56,17 +55,17 @@ def guard_body_tree() -> None:
   Fusion duplicates the work of a parent body into each child; on a chain of
   eight bodies stock MJX is three orders of magnitude slower under vmap. An
   optimisation barrier behind every body ends it. Only the CPU needs it, and the
-  wrapped function is private to mujoco-mjx, hence the narrow, idempotent patch.
+  wrapped function is private to mujoco-mjx, hence the narrow patch.
   """
-  if jax.default_backend() != "cpu" or hasattr(_mjx_scan.body_tree, "guarded"):
-    return
-  original = _mjx_scan.body_tree
+  if jax.default_backend() == "cpu":
+    _mjx_scan.body_tree = _guarded_body_tree
 
-  def body_tree(m, f, in_types, out_types, *args, reverse=False):
-    def behind_barrier(*inputs):
-      return jax.lax.optimization_barrier(f(*inputs))
 
-    return original(m, behind_barrier, in_types, out_types, *args, reverse=reverse)
+def _guarded_body_tree(m, f, in_types, out_types, *args, reverse=False):
+  def behind_barrier(*inputs):
+    return jax.lax.optimization_barrier(f(*inputs))
 
-  body_tree.guarded = True
-  _mjx_scan.body_tree = body_tree
+  return _body_tree(m, behind_barrier, in_types, out_types, *args, reverse=reverse)
+
+
+_body_tree = _mjx_scan.body_tree

@@ -68,7 +68,7 @@ class NativePhysics:
       fields = {
         name: np.asarray(getattr(batch, name), np.float32) for name in _STATE_FIELDS
       }
-    return PhysicsState(**fields)
+    return state.replace(**fields)
 
   def _advance(self, batch, velocity, close) -> None:
     scene, arm = self.scene, self.scene.arm_dof

@@ -42,8 +42,7 @@ FINGER_LENGTH = 0.057
 FINGER_ANGLE = np.pi / 6
 
 
-@struct.dataclass
-class PhysicsState:
+class PhysicsState(struct.PyTreeNode):
   """Everything an engine needs to go on."""
 
   qpos: Array  # f32[*b, nq]

@@ -52,10 +52,15 @@ DRAG_HEIGHT = 0.010
 """m; 4 mm above the plate's floor, the tips' sides against the rim."""
 
 LOW = 0.022
-"""m; below this the finger tips are behind the rim."""
+"""m; below this the finger tips are behind the rim; dragging starts."""
 
 INSIDE = 0.083
 """m; radius of the rim's centre line: a low tool closer than this is inside."""
+
+CAPTURE = 0.045
+"""m; a tool below this and within the rim goes down to drag, whatever primitive it
+follows. Well above the drag height, because a policy that misjudges where the
+primitives turn round would lift the tool off the plate."""
 
 ALIGNED = 0.02
 """m; this close to the plate's axis the tool descends: 35 mm between tips and rim."""
@@ -159,7 +164,7 @@ class PushPlate:
     return state.mocap_pos[:, self._goal, :2]
 
   def _inside(self, tool: Array, plate: Array) -> Array:
-    return (tool[:, 2] < LOW) & (_norm(tool[:, :2] - plate) < INSIDE)
+    return (tool[:, 2] < CAPTURE) & (_norm(tool[:, :2] - plate) < INSIDE)
 
 
 def _norm(x: Array) -> Array:

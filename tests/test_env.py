@@ -1,0 +1,108 @@
+"""The batch of worlds: reset, step, time limit, automatic reset, observations."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from apnpql_jax.config import EnvConfig
+from apnpql_jax.env import Env, make_env
+from apnpql_jax.evaluate import make_player, play_held_out
+from apnpql_jax.rollout import expert_policy, rollout
+
+CONFIG = EnvConfig(obs="state", backend="native", worlds=16, bank_rows=256)
+SHORT = dataclasses.replace(CONFIG, time_limit_s=0.45)
+
+
+@pytest.fixture(scope="module")
+def env() -> Env:
+  return make_env(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def pixel_chunk(env):
+  """Twelve periods of the expert in four worlds, seen by both cameras."""
+  pixels = Env(dataclasses.replace(CONFIG, obs="pixels"), env.task, env._bank)
+  play = jax.jit(
+    lambda rows, key: rollout(
+      pixels, expert_policy(pixels, noise=0.0), pixels.reset(rows), key, length=12
+    )
+  )
+  return play(jnp.arange(4), jax.random.key(0))[1]
+
+
+def test_held_out_rows_are_never_trained_on(env):
+  assert env.bank_split == 192 and env.held_out == 64
+
+
+def test_time_out_truncates_then_resets(env):
+  """Three periods, then a terminal instant, then the first instant of a new episode."""
+  short = Env(SHORT, env.task, env._bank)
+  assert SHORT.episode_steps == 3
+  play = jax.jit(
+    lambda rows, key: rollout(
+      short, expert_policy(short, noise=0.0), short.reset(rows), key, length=9
+    )
+  )
+  _, chunk = play(jnp.arange(16), jax.random.key(0))
+  step = chunk.timestep
+  expected = np.array([0, 0, 0, 1, 0, 0, 0, 1, 0], bool)
+  np.testing.assert_array_equal(step.truncated, np.tile(expected[:, None], (1, 16)))
+  assert not step.terminated.any() and not step.reward.any()
+  robot = np.asarray(step.observation.robot)
+  # A new episode starts with three equal robot states, from another row.
+  np.testing.assert_array_equal(robot[4, :, :7], robot[4, :, 14:])
+  assert (np.abs(robot[4] - robot[0]).max(-1) > 1e-3).mean() > 0.8
+  # Within an episode the stack shifts by one state per period.
+  np.testing.assert_array_equal(robot[1, :, 7:14], robot[0, :, 14:])
+
+
+def test_success_terminates_with_one_reward(env):
+  play = make_player(env, lambda _: expert_policy(env, noise=0.0))
+  figures = play_held_out(env, play, None, episodes=32, seed=0)
+  assert figures["successes"] >= 31
+  assert figures["mean_length"] < 50
+  low, high = figures["ci95"]
+  assert low < figures["success_rate"] <= high
+
+
+def test_evaluation_is_repeatable(env):
+  play = make_player(env, lambda _: expert_policy(env, noise=0.3))
+  first, again, other = (
+    play_held_out(env, play, None, episodes=32, seed=seed) for seed in (5, 5, 6)
+  )
+  assert first == again
+  assert first != other
+
+
+def test_tool_is_where_the_joints_put_it(env):
+  from apnpql_jax.sim import arm
+
+  state = jax.jit(env.reset)(jnp.arange(16))
+  observation = state.timestep.observation
+  position, _, _ = arm.forward(
+    arm.make_chain(env.task.scene), observation.robot[:, -7:-1]
+  )
+  np.testing.assert_allclose(observation.tool, position, atol=1e-5)
+
+
+def test_pixels_show_the_task(env, pixel_chunk):
+  """Plate, goal and gripper are in the images in their colours, at the right size."""
+  observation = pixel_chunk.timestep.observation
+  assert observation.global_image.shape == (12, 4, 72, 96, 3)
+  assert observation.wrist_image.shape == (12, 4, 36, 64, 3)
+  assert observation.global_image.dtype == observation.wrist_image.dtype == np.uint8
+  assert observation.objects is None
+  image = np.asarray(observation.global_image[0], int)
+  red, green, blue = np.moveaxis(image, -1, 0)
+  goal = (red > 1.8 * blue).sum((1, 2))
+  plate = (blue > 2.5 * red).sum((1, 2))
+  assert (goal > 80).all() and (goal < 400).all()
+  assert (plate > 40).all() and (plate < 200).all()
+  # What moves is seen to move.
+  moved = np.abs(image - np.asarray(observation.global_image[-1], int)).max(-1)
+  assert ((moved > 20).sum((1, 2)) > 30).all()
