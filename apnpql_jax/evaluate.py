@@ -118,7 +118,7 @@ def evaluate_run(
   env, agent = make_env(env_config), make_agent(config.agent)
   example = jax.eval_shape(lambda: initial_state(config, env, agent))
   learner = checkpoint.restore(run_dir, step, example, config=config).learner
-  play = make_player(env, lambda params: agent_policy(agent, params, greedy=True))
+  play = make_player(env, lambda params: agent_policy(agent, params, greedy=False))
   figures = play_held_out(env, play, learner.params, episodes=episodes, seed=seed)
   return {
     "task": config.env.task,

@@ -111,7 +111,7 @@ class _Reporter:
   ):
     self._config, self._env, self._folder = config, env, folder
     self._writer, self._progress = writer, progress
-    self._policy = lambda params: agent_policy(agent, params, greedy=True)
+    self._policy = lambda params: agent_policy(agent, params, greedy=False)
     self._play = make_player(env, self._policy)
     self._lap = time.monotonic()
     self._row: dict[str, Any] = {}

@@ -7,6 +7,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from apnpql_jax.agents.algorithms import ALGORITHMS, get_algorithm
@@ -144,9 +145,7 @@ def test_each_group_moves_at_its_own_learning_rate(state, update):
 
 def test_target_network_is_the_moving_average_of_all_parameters(state, update):
   after, _ = update(state, random_batch(1), jax.random.key(0))
-  expected = jax.tree.map(
-    lambda new, old: 0.05 * new + 0.95 * old, after.params, state.target_params
-  )
+  expected = optax.incremental_update(after.params, state.target_params, 0.05)
   for a, b in zip(
     jax.tree.leaves(after.target_params), jax.tree.leaves(expected), strict=True
   ):

@@ -1,7 +1,7 @@
 """AP-NPQL learns a manipulation task without physics within a minute.
 
 A point in R^6 with a gripper must go to an object, close there, and carry it to a
-goal: reward +1 once, at most 15 steps. Its action primitives are the paper's: towards
+goal: reward +1 once, at most ten steps. Its action primitives are the paper's: towards
 the object, the goal and a neutral place. A quarter of each batch is an expert's.
 """
 
@@ -19,9 +19,9 @@ from apnpql_jax.config import AgentConfig
 from apnpql_jax.types import Array, Observation, TimeStep
 
 WORLDS = 32
-LIMIT = 15
-RADIUS = 0.5
-STEP = 0.4
+LIMIT = 10
+RADIUS = 0.6
+STEP = 0.6
 CONFIG = AgentConfig(
   gamma=0.95,
   hidden=(128, 128),

@@ -86,12 +86,14 @@ def make_agent(config: AgentConfig) -> Agent:
       networks, algorithm, trained, batch, target, key_tm1
     )
     steps, opt_state = optimiser.update(grads, state.opt_state, trained)
-    params: Params = dict(optax.apply_updates(trained, steps))
+    params = jax.tree.map(jnp.add, trained, steps)
     nu = jnp.maximum(params.pop("nu"), 0.0)
     metrics |= {f"grad_norm/{k}": optax.tree.norm(grads[k]) for k in GROUPS}
     metrics["prior/nu"] = nu
-    target_params = optax.incremental_update(
-      params, state.target_params, config.target_rate
+    target_params = jax.tree.map(
+      lambda new, old: old + config.target_rate * (new - old),
+      params,
+      state.target_params,
     )
     return LearnerState(params, target_params, nu, opt_state, state.step + 1), metrics
 

@@ -42,32 +42,32 @@ GOAL_TOLERANCE = 0.03
 REST_SPEED = 0.05
 """m/s; slower than this the plate stops within 0.7 mm (v^2 / 2 mu g, mu = 0.2)."""
 
-HOVER_HEIGHT = 0.07
-"""m; tool height at which the finger tips clear the rim (24 mm) and the camera too."""
+HOVER_HEIGHT = 0.08
+"""m; tool height at which the finger tips clear the rim (34 mm) and the camera too."""
 
-CLEAR = 0.035
+CLEAR = 0.05
 """m; above this the tool may travel without touching the rim."""
 
-DRAG_HEIGHT = 0.010
-"""m; 4 mm above the plate's floor, the tips' sides against the rim."""
+DRAG_HEIGHT = 0.012
+"""m; 6 mm above the plate's floor, the tips' sides against the rim."""
 
-LOW = 0.022
-"""m; below this the finger tips are behind the rim; dragging starts."""
+LOW = 0.03
+"""m; below this the tips are behind the rim (centre line at 22 mm): dragging starts."""
 
 INSIDE = 0.083
 """m; radius of the rim's centre line: a low tool closer than this is inside."""
 
-CAPTURE = 0.045
+CAPTURE = 0.06
 """m; a tool below this and within the rim goes down to drag, whatever primitive it
 follows. Well above the drag height, because a policy that misjudges where the
 primitives turn round would lift the tool off the plate."""
 
 ALIGNED = 0.02
-"""m; this close to the plate's axis the tool descends: 35 mm between tips and rim."""
+"""m; this close to the plate's axis the tool descends: 33 mm between tips and rim."""
 
 FUNNEL = 0.055
-"""m; from here to ``ALIGNED`` the height falls linearly: tips just clear of the rim.
-A step would be sharper than a network can see in the images."""
+"""m; from here to ``ALIGNED`` the height falls linearly. A step would be sharper than
+a network can see in the images."""
 
 LOOKAHEAD = 0.07
 """m; longest step of a dragging tool's waypoint."""
@@ -125,7 +125,8 @@ class PushPlate:
     rise = waypoint(tool[:, :2], HOVER_HEIGHT)
     onto_plate = jnp.where(above | (off < 1)[:, None], waypoint(plate, funnel), rise)
     to_object = jnp.where(inside, waypoint(plate, DRAG_HEIGHT), onto_plate)
-    depth = ((LOW - tool[:, 2]) / (LOW - DRAG_HEIGHT)).clip(0.0, 1.0)
+    # Full speed from halfway down: the tip's height is what a policy knows least.
+    depth = (2 * (LOW - tool[:, 2]) / (LOW - DRAG_HEIGHT)).clip(0.0, 1.0)
     drag = goal - plate
     reach = depth * LOOKAHEAD / jnp.maximum(_norm(drag), LOOKAHEAD)
     drag = drag * reach[:, None]
