@@ -125,14 +125,18 @@ class AgentConfig:
   ap_delta: float = 0.1
   """Error in rad/s above which the loss of the action primitives becomes linear."""
 
+  m_step_delay: int = 0
+  """Updates before the M-step begins: until the values tell good from bad, the prior
+  would only follow their errors, away from the action primitives."""
+
   min_std: float = 0.05
-  """Floor of the prior's Cholesky diagonal, rad/s."""
+  """Floor of the prior's standard deviation of each joint, rad/s."""
 
   initial_std: float = 0.2
-  """The prior's Cholesky diagonal before training, rad/s."""
+  """The prior's standard deviation of each joint before training, rad/s."""
 
-  max_std: float = 0.5
-  """Limit of the prior's Cholesky entries, rad/s; the action box ends at 1."""
+  max_std: float = 0.3
+  """Limit of the prior's standard deviation of each joint, rad/s."""
 
   min_prob: float = 0.05
   """Smallest weight of a component and probability of a gripper command in the prior,

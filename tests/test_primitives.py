@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from apnpql_jax.primitives import bank, ik, tracking
-from apnpql_jax.sim import arm
+from apnpql_jax.sim import arm, physics
 from apnpql_jax.sim.kinematics import make_kinematics
 
 
@@ -31,7 +31,7 @@ def test_bank_targets_reach_their_poses(task, small_bank):
   assert report.max_position_residual < ik.POSITION_TOLERANCE
   assert report.max_rotation_residual < ik.ROTATION_TOLERANCE
   state = _at(task, rows)
-  positions, rotations = task.tool_targets(state, make_kinematics(task.scene)(state))
+  positions, rotations = task.tool_targets(state, jax.jit(make_kinematics(task.scene))(state))
   reached, turned, _ = arm.forward(arm.make_chain(task.scene), rows.targets)
   np.testing.assert_allclose(reached, positions, atol=1e-3)
   angle = np.linalg.norm(arm.rotation_error(turned, rotations), axis=-1)
@@ -56,6 +56,9 @@ def test_refinement_agrees_with_mink(task, small_bank):
 def test_following_scales_as_a_whole():
   velocity = tracking.follow(jnp.array([2.0, -1.0, 0, 0, 0, 0]), jnp.zeros(6))
   np.testing.assert_allclose(velocity, [1.0, -0.5, 0, 0, 0, 0], rtol=1e-6)
+  braking = tracking.follow(jnp.array([0.5, -0.25, 0, 0, 0, 0]), jnp.zeros(6))
+  speed = np.sqrt(2 * tracking.BRAKING * 0.5)
+  np.testing.assert_allclose(braking[:2], [speed, -speed / 2], rtol=1e-6)
   near = tracking.follow(jnp.full(6, 0.01), jnp.zeros(6))
   np.testing.assert_allclose(near, tracking.GAIN * 0.01, rtol=1e-6)
 
@@ -83,6 +86,4 @@ def test_following_reaches_a_target_without_overshoot(engines, resets, task, nam
 
 
 def _at(task, rows):
-  from apnpql_jax.sim import physics
-
   return physics.initial_state(task.scene, rows.qpos, rows.mocap_pos, rows.mocap_quat)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -70,7 +71,7 @@ def test_a_moving_plate_is_no_success(task, solved):
 
 def test_targets_depend_on_where_the_tool_is(task, resets):
   """Above and off the plate: hover. Above it: descend. Inside it: drag."""
-  kinematics = make_kinematics(task.scene)(resets)
+  kinematics = jax.jit(make_kinematics(task.scene))(resets)
   plate, _ = task.scene.free_joint("plate")
   spot = resets.qpos[:, plate : plate + 2]
   goal = resets.mocap_pos[:, 0, :2]

@@ -103,15 +103,18 @@ def make_agent(config: AgentConfig) -> Agent:
 def _make_optimiser(config: AgentConfig) -> optax.GradientTransformation:
   """Adam with a clipped global norm for each step of Algorithm 1, by group."""
 
-  def adam(learning_rate: float) -> optax.GradientTransformation:
+  def adam(learning_rate: optax.ScalarOrSchedule) -> optax.GradientTransformation:
     return optax.chain(
       optax.clip_by_global_norm(config.max_grad_norm), optax.adam(learning_rate)
     )
 
+  def m_rate(count: Array) -> Array:
+    return jnp.where(count < config.m_step_delay, 0.0, config.learning_rate_m)
+
   return optax.partition(
     {
       "e_step": adam(config.learning_rate_e),
-      "m_step": adam(config.learning_rate_m),
+      "m_step": adam(m_rate),
       "alpha": adam(config.learning_rate_alpha),
       "nu": adam(config.learning_rate_nu),
     },

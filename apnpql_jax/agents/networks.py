@@ -170,19 +170,20 @@ def prior_from_outputs(
 ) -> gmm.GripperGMM:
   """Turns raw outputs of f^bp into the mixture around the given means.
 
-  The prior must never exclude a choice: what it no longer proposes, q can neither
-  try nor find better. So components and gripper commands keep a smallest
-  probability, and the spread a floor; one entropy floor for all of them cannot see
-  to that, as a wide Gaussian makes up for a gripper that never opens. The spread has
-  a limit too: while all candidates are worth the same, nothing in the M-step pulls
-  it back into the action box.
+  Each row of a Cholesky factor is a direction times the standard deviation of that
+  joint. The deviation has a floor and a limit: as the means are fixed, a value that
+  merely rises towards one side makes the M-step widen the component, again and
+  again, until most candidates are far from every action primitive and their values
+  are guesses. Components and gripper commands keep a smallest probability, for what
+  the prior no longer proposes, q can neither try nor find better; an entropy floor
+  cannot see to that, as a wide Gaussian makes up for a gripper that never opens.
 
   Args:
     outputs: f32[*b, K * (D (D + 1) / 2 + 2)].
     mean: f32[*b, K, D].
-    min_std: floor of the diagonal of the Cholesky factors.
-    initial_std: the diagonal where the outputs are zero.
-    max_std: limit of the diagonal, and of the size of all entries below it.
+    min_std: floor of the standard deviation of each joint, rad/s.
+    initial_std: the standard deviation where the outputs are zero, rad/s.
+    max_std: limit of the standard deviation of each joint, rad/s.
     min_prob: smallest weight of a component, smallest probability of a command.
   """
   num, dim = mean.shape[-2:]
@@ -193,18 +194,15 @@ def prior_from_outputs(
   offset = math.log((initial_std - min_std) / (max_std - initial_std))
   spread = min_std + (max_std - min_std) * jax.nn.sigmoid(diagonal + offset)
   rows, columns = jnp.tril_indices(dim, k=-1)
-  axis = jnp.arange(dim)
-  scale = jnp.zeros((*mean.shape, dim), mean.dtype)
-  scale = scale.at[..., axis, axis].set(spread)
-  scale = scale.at[..., rows, columns].set(
-    max_std * jnp.tanh(initial_std / max_std * below)
-  )
+  direction = jnp.broadcast_to(jnp.eye(dim, dtype=mean.dtype), (*mean.shape, dim))
+  direction = direction.at[..., rows, columns].set(jnp.tanh(below))
+  length = jnp.sqrt(jnp.sum(jnp.square(direction), axis=-1, keepdims=True))
   weights = min_prob + (1.0 - num * min_prob) * jax.nn.softmax(logits[..., 0])
   close = min_prob + (1.0 - 2.0 * min_prob) * jax.nn.sigmoid(gripper[..., 0])
   return gmm.GripperGMM(
     logits=jnp.log(weights),
     mean=mean,
-    scale_tril=scale,
+    scale_tril=spread[..., None] / length * direction,
     gripper_logits=jnp.log(close) - jnp.log1p(-close),
   )
 

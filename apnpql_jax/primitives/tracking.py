@@ -15,9 +15,12 @@ from apnpql_jax.sim.physics import MAX_VELOCITY
 from apnpql_jax.types import Array
 
 GAIN = 2.0
-"""1/s. Under the 1.2 rad/s^2 limit a joint at 1 rad/s can brake within
-v^2 / 2a = 0.42 rad, so v = gain d needs a gain of at most 2.4 (2 a_max / v_max); the
-rest is left for the 0.15 s during which a command is held."""
+"""1/s, close to the target."""
+
+BRAKING = 0.7
+"""rad/s^2, far from it: v = sqrt(2 a d) stops within d. Less than the limit of 1.2,
+because a command is held for 0.15 s. Without this profile a gain of 2.0 overshoots
+by 0.06 rad from full speed, and only 1.7 would not."""
 
 DAMPING = 1e-3
 """m or rad; small against the Jacobian's singular values in the workspace."""
@@ -39,9 +42,11 @@ def follow(target: Array, q: Array) -> Array:
   Returns:
     f32[*b, 6], rad/s.
   """
-  velocity = GAIN * (target - q)
-  fastest = jnp.abs(velocity).max(-1, keepdims=True)
-  return velocity * (MAX_VELOCITY / jnp.maximum(fastest, MAX_VELOCITY))
+  error = target - q
+  farthest = jnp.abs(error).max(-1, keepdims=True)
+  speed = jnp.minimum(GAIN * farthest, jnp.sqrt(2 * BRAKING * farthest))
+  speed = jnp.minimum(speed, MAX_VELOCITY)
+  return error * (speed / jnp.maximum(farthest, 1e-6))
 
 
 def refine(chain: arm.ArmChain, q: Array, pos: Array, mat: Array) -> Array:

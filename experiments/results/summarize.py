@@ -1,0 +1,84 @@
+"""Curves and a table from finished runs and their evaluations.
+
+  apnpql train push_plate --seed 0 --run runs/a        # and so on
+  apnpql evaluate runs/a --episodes 200 --seed 7 --json > runs/a/evaluation.json
+  python experiments/results/summarize.py OUT runs/a runs/b runs/c
+
+Writes OUT/curves.png, OUT/table.md and OUT/<run>.csv (evaluations over steps and time).
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+import sys
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+from apnpql_jax.metrics import read_rows, Row
+from apnpql_jax.run_folder import open_run, RunFolder
+
+COLUMNS = ("step", "time/wall_s", "eval/success_rate", "eval/episodes")
+GOAL = 0.8
+
+
+def evaluations(folder: RunFolder) -> list[Row]:
+  """Rows of the held-out evaluations of a run."""
+  return [r for r in read_rows(folder.metrics_jsonl) if "eval/success_rate" in r]
+
+
+def table_row(folder: RunFolder) -> str:
+  """Seed, time to the goal, final success with interval, size of the run."""
+  rows = evaluations(folder)
+  result = json.loads((folder.path / "evaluation.json").read_text())
+  reached = [r for r in rows if (r["eval/success_rate"] or 0) >= GOAL]
+  minutes = f"{reached[0]['time/wall_s'] / 60:.1f}" if reached else "not reached"
+  low, high = result["ci95"]
+  return (
+    f"| {folder.config.seed} | {minutes} | {rows[-1]['time/wall_s'] / 60:.1f} "
+    f"| {rows[-1]['step']:,} | {result['successes']} of {result['episodes']} "
+    f"| {100 * result['success_rate']:.1f} % ({100 * low:.1f} to {100 * high:.1f}) |"
+  )
+
+
+def plot(folders: list[RunFolder], path: Path) -> None:
+  """Success rate over minutes of wall clock, one line per run."""
+  figure, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
+  for folder in folders:
+    rows = evaluations(folder)
+    minutes = [row["time/wall_s"] / 60 for row in rows]
+    rates = [100 * row["eval/success_rate"] for row in rows]
+    axes.plot(minutes, rates, "o-", label=f"seed {folder.config.seed}")
+  axes.axhline(100 * GOAL, color="grey", linestyle=":")
+  axes.set(xlabel="wall clock (min)", ylabel="held-out success (%)", ylim=(-2, 102))
+  axes.set_title(folders[0].config.env.task)
+  axes.legend()
+  figure.savefig(path, dpi=120)
+
+
+def main() -> None:
+  """Command line: OUT RUN [RUN ...]."""
+  out, *runs = map(Path, sys.argv[1:])
+  folders = sorted(map(open_run, runs), key=lambda folder: folder.config.seed)
+  out.mkdir(parents=True, exist_ok=True)
+  plot(folders, out / "curves.png")
+  head = (
+    f"| seed | min to {100 * GOAL:.0f} % | min in all | env steps | solved | rate (95 %) |",
+    "|---|---|---|---|---|---|",
+  )
+  lines = [*head, *map(table_row, folders)]
+  (out / "table.md").write_text("\n".join(lines) + "\n")
+  for folder in folders:
+    with (out / f"seed_{folder.config.seed}.csv").open("w", newline="") as file:
+      table = csv.DictWriter(file, COLUMNS, extrasaction="ignore")
+      table.writeheader()
+      table.writerows(evaluations(folder))
+  print("\n".join(lines))
+
+
+if __name__ == "__main__":
+  main()
