@@ -108,7 +108,7 @@ def _make_optimiser(config: AgentConfig) -> optax.GradientTransformation:
       optax.clip_by_global_norm(config.max_grad_norm), optax.adam(learning_rate)
     )
 
-  def m_rate(count: Array) -> Array:
+  def m_rate(count: Any) -> Any:
     return jnp.where(count < config.m_step_delay, 0.0, config.learning_rate_m)
 
   return optax.partition(

@@ -26,21 +26,22 @@ COLUMNS = ("step", "time/wall_s", "eval/success_rate", "eval/episodes")
 GOAL = 0.8
 
 
-def evaluations(folder: RunFolder) -> list[Row]:
-  """Rows of the held-out evaluations of a run."""
-  return [r for r in read_rows(folder.metrics_jsonl) if "eval/success_rate" in r]
+def evaluations(folder: RunFolder) -> list[dict[str, float]]:
+  """Step, seconds, rate and number of episodes of each held-out evaluation."""
+  rows = [r for r in read_rows(folder.metrics_jsonl) if "eval/success_rate" in r]
+  return [{name: row[name] or 0.0 for name in COLUMNS} for row in rows]
 
 
 def table_row(folder: RunFolder) -> str:
   """Seed, time to the goal, final success with interval, size of the run."""
   rows = evaluations(folder)
   result = json.loads((folder.path / "evaluation.json").read_text())
-  reached = [r for r in rows if (r["eval/success_rate"] or 0) >= GOAL]
+  reached = [r for r in rows if r["eval/success_rate"] >= GOAL]
   minutes = f"{reached[0]['time/wall_s'] / 60:.1f}" if reached else "not reached"
   low, high = result["ci95"]
   return (
     f"| {folder.config.seed} | {minutes} | {rows[-1]['time/wall_s'] / 60:.1f} "
-    f"| {rows[-1]['step']:,} | {result['successes']} of {result['episodes']} "
+    f"| {rows[-1]['step']:,.0f} | {result['successes']} of {result['episodes']} "
     f"| {100 * result['success_rate']:.1f} % ({100 * low:.1f} to {100 * high:.1f}) |"
   )
 
@@ -67,14 +68,14 @@ def main() -> None:
   out.mkdir(parents=True, exist_ok=True)
   plot(folders, out / "curves.png")
   head = (
-    f"| seed | min to {100 * GOAL:.0f} % | min in all | env steps | solved | rate (95 %) |",
+    f"| seed | min to {100 * GOAL:.0f} % | min | env steps | solved | rate (95 %) |",
     "|---|---|---|---|---|---|",
   )
   lines = [*head, *map(table_row, folders)]
   (out / "table.md").write_text("\n".join(lines) + "\n")
   for folder in folders:
     with (out / f"seed_{folder.config.seed}.csv").open("w", newline="") as file:
-      table = csv.DictWriter(file, COLUMNS, extrasaction="ignore")
+      table = csv.DictWriter(file, COLUMNS)
       table.writeheader()
       table.writerows(evaluations(folder))
   print("\n".join(lines))
