@@ -5,7 +5,7 @@ Everything needed to go on is in ``TrainState``; nothing here is.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 import contextlib
 import functools
 import math
@@ -157,7 +157,7 @@ class _Reporter:
 
 
 @contextlib.contextmanager
-def caught_signals() -> Iterator[list[int]]:
+def caught_signals() -> Generator[list[int]]:
   """Collects SIGINT and SIGTERM instead of dying of them.
 
   The iteration under way is finished and saved; a second signal acts as usual.

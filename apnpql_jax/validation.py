@@ -32,7 +32,9 @@ _POSITIVE = (
   "replay.capacity replay.batch_size total_steps rollout_length "
   "updates_per_iteration eval_every eval_episodes checkpoint_every keep_checkpoints"
 ).split()
-_NOT_NEGATIVE = ("agent.lambda_ap replay.expert_steps replay.expert_noise seed").split()
+_NOT_NEGATIVE = (
+  "agent.lambda_ap agent.m_step_delay replay.expert_steps replay.expert_noise seed"
+).split()
 
 
 def validate(

@@ -149,22 +149,28 @@ def test_fresh_networks_predict_the_configured_start():
 
 
 def test_prior_keeps_its_floors_and_limits():
-  limits = dict(min_std=0.05, initial_std=0.2, max_std=0.5, min_prob=0.05)
   rng = np.random.default_rng(3)
-  mean = jnp.zeros((200, 3, 6))
   outputs = jnp.asarray(20.0 * rng.normal(size=(200, 3 * 23)), jnp.float32)
-  prior = prior_from_outputs(outputs, mean, **limits)
-  scale = np.asarray(prior.scale_tril)
-  diagonal = np.diagonal(scale, axis1=-2, axis2=-1)
-  assert diagonal.min() == pytest.approx(0.05, abs=1e-4)
-  assert diagonal.max() == pytest.approx(0.5, abs=1e-4)
-  assert not np.any(np.triu(scale, k=1))
-  assert np.abs(scale).max() <= 0.5 + 1e-6
-  assert np.all(
-    np.abs(scale[:, :, np.tril_indices(6, -1)[0], np.tril_indices(6, -1)[1]]) > 0.0
+  prior = prior_from_outputs(
+    outputs,
+    jnp.zeros((200, 3, 6)),
+    min_std=0.05,
+    initial_std=0.2,
+    max_std=0.5,
+    min_prob=0.05,
   )
-  weights = jax.nn.softmax(prior.logits)
-  np.testing.assert_allclose(jnp.sum(jnp.exp(prior.logits), -1), 1.0, atol=1e-5)
+  scale = np.asarray(prior.scale_tril, np.float64)
+  std = np.sqrt(np.diagonal(scale @ scale.swapaxes(-1, -2), axis1=-2, axis2=-1))
+  assert std.min() == pytest.approx(0.05, abs=1e-4)
+  assert std.max() == pytest.approx(0.5, abs=1e-4)
+  assert not np.any(np.triu(scale, k=1))
+  below = scale[:, :, *np.tril_indices(6, k=-1)]
+  assert np.all(below != 0.0)
+  # No joint is determined by the others: what remains free of it is bounded below.
+  free = np.diagonal(scale, axis1=-2, axis2=-1) / std
+  assert free.min() > 1.0 / np.sqrt(6.0) - 1e-4
+  weights = np.exp(prior.logits)
+  np.testing.assert_allclose(weights.sum(-1), 1.0, atol=1e-5)
   assert weights.min() == pytest.approx(0.05, abs=1e-3)
   close = jax.nn.sigmoid(prior.gripper_logits)
   assert close.min() == pytest.approx(0.05, abs=1e-3)

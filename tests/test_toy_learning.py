@@ -174,3 +174,42 @@ def train_step(carry, key: Array):
 
   state, metrics = jax.lax.scan(learn, state, jax.random.split(key_learn, 4))
   return (state, world, ring, demos), jax.tree.map(lambda x: x[-1], metrics)
+
+
+def test_expert_and_random_choice_frame_the_task():
+  """The task is solvable, and not by chance."""
+
+  def random(world: World, key: Array) -> Array:
+    arm, gripper = jax.random.split(key)
+    choice = jax.random.randint(arm, (WORLDS,), 0, 3)
+    velocity = world.timestep.primitives[jnp.arange(WORLDS), choice]
+    close = jax.random.bernoulli(gripper, 0.5, (WORLDS, 1)).astype(jnp.float32)
+    return jnp.concatenate([velocity, close], axis=-1)
+
+  keys = jax.random.split(jax.random.key(1), 8)
+  rates = [
+    jnp.mean(jax.vmap(lambda key, p=policy: success_rate(p, key))(keys))
+    for policy in (expert, random)
+  ]
+  assert rates[0] > 0.97
+  assert rates[1] < 0.2
+
+
+def test_agent_learns_to_carry_the_object_to_the_goal():
+  key_begin, key_train, key_test = jax.random.split(jax.random.key(0), 3)
+  carry = jax.jit(begin)(key_begin)
+
+  def train(carry):
+    return jax.lax.scan(train_step, carry, jax.random.split(key_train, 700))
+
+  @jax.jit
+  def rate(state: LearnerState) -> Array:
+    each = jax.vmap(lambda key: success_rate(agent(state, greedy=False), key))
+    return jnp.mean(each(jax.random.split(key_test, 8)))
+
+  before = rate(carry[0])
+  (state, *_), metrics = jax.jit(train)(carry)
+  assert before < 0.1
+  assert rate(state) > 0.9
+  # It was the algorithm, not only the primitives: the KL limit is in force.
+  assert jnp.mean(metrics["npql/kl_over_eps"][-50:]) > 0.7
