@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,12 @@ import optax
 import pytest
 
 from apnpql_jax.agents.algorithms import ALGORITHMS, get_algorithm
-from apnpql_jax.agents.learner import bellman_target, make_agent, total_loss
+from apnpql_jax.agents.learner import (
+  bellman_target,
+  make_agent,
+  make_optimiser,
+  total_loss,
+)
 from apnpql_jax.agents.networks import GROUPS
 from apnpql_jax.config import AgentConfig, ConfigError
 from apnpql_jax.types import Observation, Transition
@@ -163,18 +167,14 @@ def test_nu_never_falls_below_zero(agent):
 
 
 def test_m_step_waits_for_its_delay():
-  agent = make_agent(dataclasses.replace(CONFIG, m_step_delay=2))
-  state = agent.init(jax.random.key(0), random_batch(0).observation_tm1)
-  biases = [state.params["bp"]["out"]["bias"]]
-
-  def body(state, key):
-    state, _ = agent.update(state, random_batch(1), key)
-    return state, state.params["bp"]["out"]["bias"]
-
-  keys = jax.random.split(jax.random.key(0), 3)
-  biases.extend(jax.jit(lambda s: jax.lax.scan(body, s, keys))(state)[1])
-  moved = [bool(np.any(b != a)) for a, b in itertools.pairwise(biases)]
-  assert moved == [False, False, True]
+  optimiser = make_optimiser(dataclasses.replace(CONFIG, m_step_delay=2))
+  trained = dict.fromkeys((*GROUPS, "nu"), jnp.ones(3))
+  opt_state = optimiser.init(trained)
+  moved = []
+  for _ in range(3):
+    steps, opt_state = optimiser.update(trained, opt_state, trained)
+    moved.append({k for k, step in steps.items() if np.any(step)})
+  assert moved == [set(trained) - {"bp"}] * 2 + [set(trained)]
 
 
 def test_transitions_of_weight_zero_change_nothing(state, update):
@@ -215,8 +215,10 @@ def test_losses_fall_on_a_fixed_batch(agent, state):
   for name in ("loss/q", "loss/ap", "ap/error"):
     first, last = metrics[name][:10].mean(), metrics[name][-10:].mean()
     assert last < 0.3 * first, name
-  # The temperature follows its dual to where the KL limit holds.
-  assert metrics["npql/kl_over_eps"][-100:].mean() == pytest.approx(1.0, abs=0.25)
+  # The temperature follows its dual: the KL limit comes into force.
+  kl = metrics["npql/kl_over_eps"]
+  assert kl[:10].mean() < 0.1
+  assert 0.4 < kl[-100:].mean() < 1.5
 
 
 @pytest.mark.parametrize("camera", ["global_image", "wrist_image"])

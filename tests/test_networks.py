@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from apnpql_jax.agents import encoder
-from apnpql_jax.agents.networks import GROUPS, make_networks, prior_from_outputs
+from apnpql_jax.agents.networks import GROUPS, make_networks
+from apnpql_jax.agents.prior import one_way_clip, prior_from_outputs
 from apnpql_jax.config import AgentConfig
 from apnpql_jax.types import Observation
 
@@ -171,10 +172,25 @@ def test_prior_keeps_its_floors_and_limits():
   assert free.min() > 1.0 / np.sqrt(6.0) - 1e-4
   weights = np.exp(prior.logits)
   np.testing.assert_allclose(weights.sum(-1), 1.0, atol=1e-5)
-  assert weights.min() == pytest.approx(0.05, abs=1e-3)
+  # One at the floor, one or both others at the limit.
+  one, both = 0.05, 0.05 / 0.9 / (2 + 0.05 / 0.9)
+  assert weights.min() == pytest.approx(both, abs=1e-3)
+  lone = weights[(weights > 0.8).any(-1)]
+  assert lone.min() >= one - 1e-3
   close = jax.nn.sigmoid(prior.gripper_logits)
   assert close.min() == pytest.approx(0.05, abs=1e-3)
   assert close.max() == pytest.approx(0.95, abs=1e-3)
+
+
+def test_a_limit_lets_the_gradient_back_in():
+  x = jnp.array([-3.0, -1.0, 0.5, 1.0, 3.0])
+  np.testing.assert_array_equal(
+    one_way_clip(x, -1.0, 1.0), jnp.array([-1.0, -1.0, 0.5, 1.0, 1.0])
+  )
+  pull = jax.vjp(lambda x: one_way_clip(x, -1.0, 1.0), x)[1]
+  # Descent goes against the gradient: a positive one leads down.
+  np.testing.assert_array_equal(pull(jnp.ones(5))[0], [0, 0, 1, 1, 1])
+  np.testing.assert_array_equal(pull(-jnp.ones(5))[0], [-1, -1, -1, 0, 0])
 
 
 def test_prior_means_are_the_primitives_within_the_action_box():

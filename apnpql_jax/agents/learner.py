@@ -58,7 +58,7 @@ def make_agent(config: AgentConfig) -> Agent:
   validate(TrainConfig(agent=config), algorithms=tuple(ALGORITHMS))
   networks = make_networks(config)
   algorithm = get_algorithm(config.algorithm)
-  optimiser = _make_optimiser(config)
+  optimiser = make_optimiser(config)
 
   def init(key: Array, observation: Observation) -> LearnerState:
     params = networks.init(key, observation)
@@ -100,7 +100,7 @@ def make_agent(config: AgentConfig) -> Agent:
   return Agent(networks, init, act, update)
 
 
-def _make_optimiser(config: AgentConfig) -> optax.GradientTransformation:
+def make_optimiser(config: AgentConfig) -> optax.GradientTransformation:
   """Adam with a clipped global norm for each step of Algorithm 1, by group."""
 
   def adam(learning_rate: optax.ScalarOrSchedule) -> optax.GradientTransformation:

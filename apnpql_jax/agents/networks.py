@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from apnpql_jax.agents.encoder import Encoder
+from apnpql_jax.agents.prior import prior_from_outputs, prior_size
 from apnpql_jax.config import AgentConfig
 from apnpql_jax.dists import categorical, gmm
 from apnpql_jax.types import ARM_DOF, NUM_PRIMITIVES, Array, Observation
@@ -142,7 +143,7 @@ class Networks:
 def make_networks(config: AgentConfig) -> Networks:
   """The modules of the paper's Fig. 2 with the sizes of ``config``."""
   head = functools.partial(Head, config.hidden)
-  per_component = _tril_size(ARM_DOF) + 2
+  per_component = prior_size(ARM_DOF)
   atoms = np.linspace(config.v_min, config.v_max, config.num_atoms)
   initial_logits = tuple(categorical.broadest_logits(config.initial_value, atoms))
   modules = {
@@ -157,58 +158,6 @@ def make_networks(config: AgentConfig) -> Networks:
     "alpha": head(1),
   }
   return Networks(modules, config)
-
-
-def prior_from_outputs(
-  outputs: Array,
-  mean: Array,
-  *,
-  min_std: float,
-  initial_std: float,
-  max_std: float,
-  min_prob: float,
-) -> gmm.GripperGMM:
-  """Turns raw outputs of f^bp into the mixture around the given means.
-
-  Each row of a Cholesky factor is a direction times the standard deviation of that
-  joint. The deviation has a floor and a limit: as the means are fixed, a value that
-  merely rises towards one side makes the M-step widen the component, again and
-  again, until most candidates are far from every action primitive and their values
-  are guesses. Components and gripper commands keep a smallest probability, for what
-  the prior no longer proposes, q can neither try nor find better; an entropy floor
-  cannot see to that, as a wide Gaussian makes up for a gripper that never opens.
-
-  Args:
-    outputs: f32[*b, K * (D (D + 1) / 2 + 2)].
-    mean: f32[*b, K, D].
-    min_std: floor of the standard deviation of each joint, rad/s.
-    initial_std: the standard deviation where the outputs are zero, rad/s.
-    max_std: limit of the standard deviation of each joint, rad/s.
-    min_prob: smallest weight of a component, smallest probability of a command.
-  """
-  num, dim = mean.shape[-2:]
-  outputs = outputs.reshape(*outputs.shape[:-1], num, -1)
-  diagonal, below, logits, gripper = jnp.split(
-    outputs, [dim, _tril_size(dim), _tril_size(dim) + 1], axis=-1
-  )
-  offset = math.log((initial_std - min_std) / (max_std - initial_std))
-  spread = min_std + (max_std - min_std) * jax.nn.sigmoid(diagonal + offset)
-  rows, columns = jnp.tril_indices(dim, k=-1)
-  direction = jnp.broadcast_to(jnp.eye(dim, dtype=mean.dtype), (*mean.shape, dim))
-  direction = direction.at[..., rows, columns].set(jnp.tanh(below))
-  length = jnp.sqrt(jnp.sum(jnp.square(direction), axis=-1, keepdims=True))
-  weights = min_prob + (1.0 - num * min_prob) * jax.nn.softmax(logits[..., 0])
-  close = min_prob + (1.0 - 2.0 * min_prob) * jax.nn.sigmoid(gripper[..., 0])
-  return gmm.GripperGMM(
-    logits=jnp.log(weights),
-    mean=mean,
-    scale_tril=spread[..., None] / length * direction,
-    gripper_logits=jnp.log(close) - jnp.log1p(-close),
-  )
-
-
-def _tril_size(dim: int) -> int:
-  return dim * (dim + 1) // 2
 
 
 def _inverse_softplus(x: float) -> float:

@@ -1,0 +1,98 @@
+"""The behaviour prior from the outputs of its head, in limits it can leave again."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+
+from apnpql_jax.dists import gmm
+from apnpql_jax.types import Array
+
+
+def prior_from_outputs(
+  outputs: Array,
+  mean: Array,
+  *,
+  min_std: float,
+  initial_std: float,
+  max_std: float,
+  min_prob: float,
+) -> gmm.GripperGMM:
+  """Turns raw outputs of f^bp into the mixture around the given means.
+
+  Each row of a Cholesky factor is a direction times the standard deviation of that
+  joint. The deviation has a floor and a limit: as the means are fixed, a value that
+  merely rises towards one side makes the M-step widen the component, again and
+  again, until most candidates are far from every action primitive and their values
+  are guesses. Components and gripper commands keep a smallest probability, for what
+  the prior no longer proposes, q can neither try nor find better; an entropy floor
+  cannot see to that, as a wide Gaussian makes up for a gripper that never opens.
+
+  The limits are one-way clips and not squashing functions: in the first updates the
+  values are noise, Adam drives the outputs far to one side at a speed that does not
+  depend on the gradient's size, and from there a sigmoid or softmax never returns.
+
+  Args:
+    outputs: f32[*b, K * prior_size(D)].
+    mean: f32[*b, K, D].
+    min_std: floor of the standard deviation of each joint, rad/s.
+    initial_std: the standard deviation where the outputs are zero, rad/s.
+    max_std: limit of the standard deviation of each joint, rad/s.
+    min_prob: weight of a component that stands at the floor while one of the others
+      stands at the limit; smallest probability of a gripper command.
+  """
+  num, dim = mean.shape[-2:]
+  outputs = outputs.reshape(*outputs.shape[:-1], num, -1)
+  below_end = dim * (dim + 1) // 2
+  log_std, below, logits, gripper = jnp.split(
+    outputs, [dim, below_end, below_end + 1], axis=-1
+  )
+  log_std = one_way_clip(
+    log_std + math.log(initial_std), math.log(min_std), math.log(max_std)
+  )
+  rows, columns = jnp.tril_indices(dim, k=-1)
+  direction = jnp.broadcast_to(jnp.eye(dim, dtype=mean.dtype), (*mean.shape, dim))
+  direction = direction.at[..., rows, columns].set(one_way_clip(below, -1.0, 1.0))
+  length = jnp.sqrt(jnp.sum(jnp.square(direction), axis=-1, keepdims=True))
+  widest = 0.5 * math.log((1.0 - (num - 1) * min_prob) / min_prob)
+  logits = one_way_clip(logits[..., 0], -widest, widest)
+  surest = math.log((1.0 - min_prob) / min_prob)
+  return gmm.GripperGMM(
+    logits=jax.nn.log_softmax(logits),
+    mean=mean,
+    scale_tril=jnp.exp(log_std)[..., None] / length * direction,
+    gripper_logits=one_way_clip(gripper[..., 0], -surest, surest),
+  )
+
+
+def prior_size(dim: int) -> int:
+  """Outputs per component: Cholesky factor, weight, gripper."""
+  return dim * (dim + 1) // 2 + 2
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(1, 2))
+def one_way_clip(x: Array, low: float, high: float) -> Array:
+  """``clip`` with a gradient that leads back: what leads further out is dropped.
+
+  Args:
+    x: f32[*b].
+    low: lower limit.
+    high: upper limit.
+  """
+  return jnp.clip(x, low, high)
+
+
+def _forward(x: Array, low: float, high: float) -> tuple[Array, Array]:
+  return jnp.clip(x, low, high), x
+
+
+def _backward(low: float, high: float, x: Array, grad: Array) -> tuple[Array]:
+  # Descent moves x against the gradient: a negative one pushes it up.
+  outwards = ((x >= high) & (grad < 0)) | ((x <= low) & (grad > 0))
+  return (jnp.where(outwards, 0.0, grad),)
+
+
+one_way_clip.defvjp(_forward, _backward)
