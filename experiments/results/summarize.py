@@ -19,7 +19,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-from apnpql_jax.metrics import Row, read_rows
+from apnpql_jax.metrics import read_rows
 from apnpql_jax.run_folder import RunFolder, open_run
 
 COLUMNS = ("step", "time/wall_s", "eval/success_rate", "eval/episodes")
