@@ -20,8 +20,8 @@ BACKENDS = ("auto", "mjx", "native")
 OBSERVATIONS = ("pixels", "state")
 
 _PIXEL_BYTES = 3 * (72 * 96 + 36 * 64)
-_OTHER_BYTES = 4 * (21 + 7 + 18 + 1) + 2
-"""Robot state, action, primitive labels, reward (f32) and the two end flags."""
+_OTHER_BYTES = 4 * (21 + 3 + 7 + 18 + 1) + 2
+"""Robot state, tool, action, primitive labels, reward (f32) and the two end flags."""
 
 _POSITIVE = (
   "env.worlds env.time_limit_s env.control_period_s env.bank_rows "

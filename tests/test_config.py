@@ -132,7 +132,7 @@ def test_replay_larger_than_memory_is_refused():
   with pytest.raises(ConfigError, match="GiB.*replay.capacity"):
     validate(TrainConfig(), memory_bytes=need - 1)
   # Two images of three bytes a pixel, in every slot of both replays.
-  slots = 51_200 + 64 * 94
+  slots = 51_200 + 6_400
   assert need > slots * 3 * (72 * 96 + 36 * 64)
   assert replay_bytes(changed("env.obs", "state")) < need / 100
 

@@ -25,7 +25,7 @@ def prior_from_outputs(
 
   Each row of a Cholesky factor is a direction times the standard deviation of that
   joint. The deviation has a floor and a limit: as the means are fixed, a value that
-  merely rises towards one side makes the M-step widen the component, again and
+  merely rises towards one side can make the M-step widen the component, again and
   again, until most candidates are far from every action primitive and their values
   are guesses. Components and gripper commands keep a smallest probability, for what
   the prior no longer proposes, q can neither try nor find better; an entropy floor
