@@ -87,10 +87,9 @@ def train(args: Train, argv: Sequence[str]) -> Json:
 
   from apnpql_jax.train import train as run_training
 
-  if args.resume is not None:
-    return run_training(config, run_dir, resume=True)
-  with runs.fresh_run_dir(run_dir) as folder:
-    return run_training(config, folder, resume=False)
+  return run_training(
+    config, run_dir, resume=args.resume is not None, overwrite=args.overwrite
+  )
 
 
 def evaluate(args: Evaluate, argv: Sequence[str]) -> Json:

@@ -213,6 +213,9 @@ class TrainConfig:
   video: bool = True
   """Write a video of evaluation episodes."""
 
+  sinks: tuple[str, ...] = ()
+  """Where metrics go besides the run folder: tensorboard, wandb."""
+
 
 def config_to_json(config: TrainConfig) -> str:
   """The configuration as indented JSON text, nested like the dataclasses."""

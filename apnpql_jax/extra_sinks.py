@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import importlib.util
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,10 @@ class TensorboardSink:
   """Event files in ``tensorboard/`` of the run folder (extra ``tb``)."""
 
   def __init__(self, run_dir: Path, config: Mapping[str, Any]):
-    """Raises ConfigError if tensorboardX is missing."""
+    """Opens the event file; ``config`` is not shown."""
     del config
-    try:
-      from tensorboardX import SummaryWriter
-    except ImportError:
-      raise _missing("tensorboardX", "tb") from None
+    from tensorboardX import SummaryWriter
+
     self._writer = SummaryWriter(logdir=str(run_dir / "tensorboard"))
 
   def write(self, step: int, row: Mapping[str, float]) -> None:
@@ -36,11 +35,9 @@ class WandbSink:
   """A run of the project ``apnpql_jax``, named like the folder (extra ``wandb``)."""
 
   def __init__(self, run_dir: Path, config: Mapping[str, Any]):
-    """Raises ConfigError if wandb is missing."""
-    try:
-      import wandb
-    except ImportError:
-      raise _missing("wandb", "wandb") from None
+    """Starts the run with the settings of ``config``."""
+    import wandb
+
     self._run = wandb.init(
       project="apnpql_jax", name=run_dir.name, dir=str(run_dir), config=dict(config)
     )
@@ -54,7 +51,27 @@ class WandbSink:
     self._run.finish()
 
 
-_SINKS = {"tensorboard": TensorboardSink, "wandb": WandbSink}
+_SINKS = {
+  "tensorboard": (TensorboardSink, "tensorboardX", "tb"),
+  "wandb": (WandbSink, "wandb", "wandb"),
+}
+"""Name -> class, the package it needs, the extra that installs it."""
+
+
+def check_sinks(names: Sequence[str]) -> None:
+  """Refuses sinks that could not be opened.
+
+  Raises:
+    ConfigError: an unknown name, or its package is not installed.
+  """
+  for name in names:
+    check_name("metric sink", name, list(_SINKS))
+    _, package, extra = _SINKS[name]
+    if importlib.util.find_spec(package) is None:
+      raise ConfigError(
+        f"metric sink {name!r} needs {package}, which is not installed: "
+        f"pip install 'apnpql-jax[{extra}]'"
+      )
 
 
 def make_sinks(
@@ -66,16 +83,5 @@ def make_sinks(
     names: of ``tensorboard`` and ``wandb``.
     run_dir: an existing run folder.
     config: plain data shown beside the curves.
-
-  Raises:
-    ConfigError: an unknown name, or its package is not installed.
   """
-  for name in names:
-    check_name("metric sink", name, list(_SINKS))
-  return [_SINKS[name](run_dir, config) for name in names]
-
-
-def _missing(package: str, extra: str) -> ConfigError:
-  return ConfigError(
-    f"{package} is not installed; install it with: pip install 'apnpql-jax[{extra}]'"
-  )
+  return [_SINKS[name][0](run_dir, config) for name in names]

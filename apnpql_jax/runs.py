@@ -25,6 +25,7 @@ MAY_CHANGE = (
   "checkpoint_every",
   "keep_checkpoints",
   "video",
+  "sinks",
 )
 """Settings that a resumed run may change: none of them alters what is learned from a
 given state of the run."""

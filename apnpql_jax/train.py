@@ -16,11 +16,12 @@ from typing import Any
 
 import jax
 
-from apnpql_jax import checkpoint, memory, run_folder
+from apnpql_jax import checkpoint, codec, memory, run_folder
 from apnpql_jax.agents.learner import Agent, make_agent
 from apnpql_jax.config import TrainConfig
 from apnpql_jax.env import Env, make_env
 from apnpql_jax.evaluate import make_player, play_held_out
+from apnpql_jax.extra_sinks import check_sinks, make_sinks
 from apnpql_jax.iteration import TrainState, initial_state, make_iteration
 from apnpql_jax.metrics import MetricWriter, plot_curve, read_rows
 from apnpql_jax.progress import TrainProgress
@@ -32,13 +33,16 @@ EVAL_SEED = 1
 """Evaluations during training always play the same held-out episodes."""
 
 
-def train(config: TrainConfig, run_dir: Path, *, resume: bool) -> dict[str, Any]:
+def train(
+  config: TrainConfig, run_dir: Path, *, resume: bool = False, overwrite: bool = False
+) -> dict[str, Any]:
   """Trains to ``config.total_steps``, or until a signal, then saves.
 
   Args:
     config: everything that decides the run.
-    run_dir: the run folder, empty unless resumed.
+    run_dir: the run folder.
     resume: go on from the newest checkpoint of ``run_dir``.
+    overwrite: replace the run that ``run_dir`` holds, once the new one can start.
 
   Returns:
     the run folder, steps, updates and the last evaluation.
@@ -47,6 +51,7 @@ def train(config: TrainConfig, run_dir: Path, *, resume: bool) -> dict[str, Any]
     ConfigError: before anything is written.
     KeyboardInterrupt: SIGINT or SIGTERM came; the state is saved.
   """
+  check_sinks(config.sinks)
   env, agent = make_env(config.env), make_agent(config.agent)
   build = functools.partial(initial_state, config, env, agent)
   example = jax.eval_shape(build)
@@ -55,11 +60,15 @@ def train(config: TrainConfig, run_dir: Path, *, resume: bool) -> dict[str, Any]
     folder = run_folder.open_run(run_dir)
     state = checkpoint.restore(run_dir, None, example, config=config)
   else:
-    folder = run_folder.create(run_dir, config)
     state = build()
+    folder = run_folder.create(run_dir, config, overwrite=overwrite)
   start = int(state.env_steps) if resume else None
   with (
-    MetricWriter(folder.path, resume_step=start) as writer,
+    MetricWriter(
+      folder.path,
+      resume_step=start,
+      sinks=make_sinks(config.sinks, folder.path, dict(codec.flatten(config))),
+    ) as writer,
     checkpoint.CheckpointWriter(
       folder.path, config, keep=config.keep_checkpoints, resume_step=start
     ) as saver,

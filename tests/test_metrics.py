@@ -8,6 +8,7 @@ import json
 import os
 from pathlib import Path
 import pty
+import struct
 import sys
 
 from hypothesis import given, settings, strategies as st
@@ -16,10 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
+from tensorboardX.proto import event_pb2
 
 from apnpql_jax import metrics
 from apnpql_jax.config import ConfigError
-from apnpql_jax.extra_sinks import make_sinks
+from apnpql_jax.extra_sinks import check_sinks, make_sinks
 from apnpql_jax.progress import TrainProgress
 
 
@@ -138,19 +140,33 @@ def test_more_sinks_get_the_same_numbers(tmp_path: Path):
   assert sink.rows == [(3, {"a": 0.5})] and sink.closed
 
 
-def test_extras_that_are_unknown_or_missing_are_named(
-  tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_tensorboard_holds_every_number(tmp_path: Path):
+  check_sinks(["tensorboard"])
+  (sink,) = make_sinks(["tensorboard"], tmp_path, {"seed": 0})
+  sink.write(3, {"a/b": 0.5, "c": -2.0})
+  sink.close()
+  (path,) = (tmp_path / "tensorboard").iterdir()
+  data, found, at = path.read_bytes(), [], 0
+  while at < len(data):  # Records of TFRecord: length, its check, event, its check.
+    (length,) = struct.unpack_from("<Q", data, at)
+    event = event_pb2.Event.FromString(data[at + 12 : at + 12 + length])
+    found += [(event.step, v.tag, v.simple_value) for v in event.summary.value]
+    at += 16 + length
+  assert found == [(3, "a/b", 0.5), (3, "c", -2.0)]
+
+
+def test_extras_that_are_unknown_or_missing_are_named(monkeypatch: pytest.MonkeyPatch):
   with pytest.raises(ConfigError, match="choose from tensorboard, wandb"):
-    make_sinks(["tensorflow"], tmp_path, {})
+    check_sinks(["tensorflow"])
   for name, package, extra in (
     ("tensorboard", "tensorboardX", "tb"),
     ("wandb", "wandb", "wandb"),
   ):
-    monkeypatch.setitem(sys.modules, package, None)  # As if it were not installed.
-    with pytest.raises(ConfigError, match=rf"{package} .*apnpql-jax\[{extra}\]"):
-      make_sinks([name], tmp_path, {})
-  assert make_sinks([], tmp_path, {}) == []
+    monkeypatch.delitem(sys.modules, package, raising=False)
+    monkeypatch.setattr(sys, "path", [])  # As if nothing were installed.
+    with pytest.raises(ConfigError, match=rf"{package}, .*apnpql-jax\[{extra}\]"):
+      check_sinks([name])
+  check_sinks([])
 
 
 def test_curve_shows_where_the_success_rate_is(tmp_path: Path):

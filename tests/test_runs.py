@@ -41,7 +41,8 @@ def test_resume_may_change_only_what_does_not_alter_learning(tmp_path):
   run = write_run(tmp_path / "a")
   for name in runs.MAY_CHANGE:
     value = getattr(TrainConfig(), name)
-    other = not value if isinstance(value, bool) else value + 1
+    other = {bool: lambda x: not x, int: lambda x: x + 1, tuple: lambda x: (*x, "a")}
+    other = other[type(value)](value)
     runs.check_resumable(run, dataclasses.replace(TrainConfig(), **{name: other}))
   fixed = {f.name for f in dataclasses.fields(TrainConfig)} - set(runs.MAY_CHANGE)
   for name in fixed - {"env", "agent", "replay"}:
