@@ -132,13 +132,16 @@ def collect(args: Collect, argv: Sequence[str]) -> Json:
 
 
 def list_names(args: List, argv: Sequence[str]) -> Json:
-  """The names that other commands accept."""
+  """The names that other commands accept, and what each task costs in MJX."""
   del args, argv
   from apnpql_jax import tasks
   from apnpql_jax.agents import algorithms
+  from apnpql_jax.sim.mjx import contact_budget
 
+  names = tasks.task_names()
   return {
-    "tasks": list(tasks.task_names()),
+    "tasks": names,
+    "mjx_budget": {name: contact_budget(tasks.make_task(name).scene) for name in names},
     "presets": presets.preset_names(),
     "algorithms": list(algorithms.ALGORITHMS),
     "backends": list(BACKENDS),
@@ -219,8 +222,13 @@ def _show_figures(result: Json) -> str:
 
 
 def _show_names(result: Json) -> str:
-  width = max(map(len, result))
-  return "\n".join(f"{kind:<{width}}  {' '.join(v)}" for kind, v in result.items())
+  budgets = [
+    f"{task} ({budget['contacts']} contacts, {budget['constraint_rows']} rows)"
+    for task, budget in result["mjx_budget"].items()
+  ]
+  lists = result | {"mjx_budget": budgets}
+  width = max(map(len, lists))
+  return "\n".join(f"{kind:<{width}}  {', '.join(v)}" for kind, v in lists.items())
 
 
 def _help() -> str:
