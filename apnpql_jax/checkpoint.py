@@ -109,8 +109,10 @@ class CheckpointWriter:
 
   def close(self) -> None:
     """Returns when everything saved is on disk; raises what a save failed of."""
-    self._manager.wait_until_finished()
-    self._manager.close()
+    try:
+      self._manager.wait_until_finished()
+    finally:
+      self._manager.close()
 
   def __enter__(self) -> CheckpointWriter:
     return self
