@@ -1,0 +1,47 @@
+"""Geometry that the tasks share: headings, turns, funnels.
+
+Batched over worlds on the first axis; lengths in m, angles in rad.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from apnpql_jax.types import Array
+
+
+def norm(x: Array) -> Array:
+  """f32[*b, n] -> f32[*b], with a gradient at zero."""
+  return jnp.sqrt((x**2).sum(-1) + 1e-12)
+
+
+def yaw(quat: Array) -> Array:
+  """Heading of the x axis over the table, f32[*b, 4] (wxyz) -> f32[*b]."""
+  w, x, y, z = jnp.moveaxis(quat, -1, 0)
+  return jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+
+
+def fold(angle: Array, period: float) -> Array:
+  """The equivalent angle nearest to zero of a shape that repeats every ``period``."""
+  return angle - period * jnp.round(angle / period)
+
+
+def turn_z(angle: Array) -> Array:
+  """Rotation about the world's z axis, f32[*b] -> f32[*b, 3, 3]."""
+  c, s, zero, one = jnp.cos(angle), jnp.sin(angle), 0 * angle, 0 * angle + 1
+  rows = [[c, -s, zero], [s, c, zero], [zero, zero, one]]
+  return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
+
+
+def up(xy: Array, height: Array | float) -> Array:
+  """The point at ``height`` over ``xy``, f32[*b, 2] -> f32[*b, 3]."""
+  height = jnp.broadcast_to(jnp.asarray(height), xy.shape[:-1])
+  return jnp.concatenate([xy, height[..., None]], -1)
+
+
+def funnel(off: Array, *, aligned: float, wide: float) -> Array:
+  """0 within ``aligned``, 1 beyond ``wide``, linear between: how far to stay up.
+
+  A step instead would be sharper than a network can see in the images.
+  """
+  return ((off - aligned) / (wide - aligned)).clip(0.0, 1.0)

@@ -1,0 +1,224 @@
+"""Picking and placing plate: take it out of its holder and put it into the goal box.
+
+The plate stands on its edge; it is gripped at the top of the edge by a tool that
+points down. Primitives, so that following one of them never knocks the plate over:
+
+- object: go above the plate, turn the fingers across it and, through a funnel, down
+  until its edge is between the open pads; stay there.
+- goal: with the plate in hand, lift it, the further the more it also moves towards
+  the box, turn it across the box's longer side and, through a funnel, lower it to the
+  floor; with empty hands, go above the box.
+- neutral: the configuration of the keyframe.
+
+A low tool that is not at the plate rises first; fingers that are closed on nothing do
+not descend.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from apnpql_jax.presets import mjcf_path
+from apnpql_jax.sim import arm
+from apnpql_jax.sim.kinematics import Kinematics
+from apnpql_jax.sim.physics import PhysicsState
+from apnpql_jax.sim.scene import load_scene
+from apnpql_jax.tasks import geometry
+from apnpql_jax.tasks.pinch import Pinch, pick_and_place
+from apnpql_jax.tasks.task import ResetDraw, register
+from apnpql_jax.types import Array
+
+WORKSPACE = ((0.40, 0.52), (-0.22, 0.22))
+"""m; x and y ranges of the holder and the box, within reach of a vertical tool."""
+
+HOLDER_YAW, BOX_YAW = 0.5, 0.3
+"""rad; turned by at most this."""
+
+MIN_DISTANCE = 0.26
+"""m between holder and box: half the box's diagonal (154 mm), the plate, fingers."""
+
+ARM_NOISE = 0.15
+"""rad; uniform spread of the initial joint angles around the neutral ones."""
+
+THICKNESS = 0.012
+"""m; of the plate."""
+
+RADIUS = 0.0647
+"""m; from the plate's centre to the middle of a side of its octagon."""
+
+GRASP_INSET = 0.013
+"""m from the plate's edge to the pads' centre: the pads are 20 mm long."""
+
+ALIGNED, FUNNEL = 0.012, 0.05
+"""m; the tool descends fully within the first, stays up beyond the second."""
+
+LEVER = 0.05
+"""m/rad; how much a twist of the fingers counts as being off."""
+
+HOVER = 0.06
+"""m; height over the grasp at which the open finger tips clear the plate."""
+
+TRAVEL = 0.22
+"""m; tool height at which closed fingers clear the standing plate (135 mm)."""
+
+LIFT = 0.085
+"""m; how high the plate is carried, swinging: jaws and walls are 35 and 40 mm high."""
+
+FREE = 0.04
+"""m; lifted this high, the plate moves sideways at full speed."""
+
+INSIDE = (0.12, 0.085)
+"""m; half the inner length and width of the box."""
+
+ON_FLOOR = 0.012
+"""m; success allows the plate's lowest point this far above the table."""
+
+REST_SPEED = 0.05
+"""m/s; above float32 contact noise."""
+
+CLEAR = 0.05
+"""m; the gripper has let go when its pinch point is this far from the plate's edge."""
+
+
+@register("place_plate")
+class PlacePlate:
+  """See the module's docstring; implements ``tasks.task.Task``."""
+
+  name = "place_plate"
+
+  def __init__(self):
+    self.scene = load_scene(mjcf_path("place_plate"), cameras=("global", "wrist"))
+    self._plate, self._plate_dof = self.scene.free_joint("plate")
+    self._goal, self._holder = self.scene.mocap("goal"), self.scene.mocap("holder")
+    self._neutral_qpos = self.scene.keyframe("neutral")
+    chain = arm.make_chain(self.scene)
+    neutral = jnp.asarray(self._neutral_qpos[self.scene.arm_qpos], jnp.float32)
+    self._neutral_pos, self._neutral_mat, _ = arm.forward(chain, neutral)
+    self._hand = Pinch(self.scene, self._neutral_mat, width=THICKNESS, above=0.0)
+
+  def sample_resets(self, rng: np.random.Generator, count: int) -> ResetDraw:
+    """See ``Task.sample_resets``."""
+    low, high = np.array(WORKSPACE).T
+    holder, goal = rng.uniform(low, high, (2, count, 2))
+    while (near := np.linalg.norm(holder - goal, axis=-1) < MIN_DISTANCE).any():
+      again = int(near.sum())
+      holder[near], goal[near] = rng.uniform(low, high, (2, again, 2))
+    qpos = np.tile(self._neutral_qpos, (count, 1))
+    qpos[:, self.scene.arm_qpos] += rng.uniform(-ARM_NOISE, ARM_NOISE, (count, 6))
+    pos, quat = np.zeros((count, 2, 3)), np.zeros((count, 2, 4))
+    for index, spot, spread in (
+      (self._holder, holder, HOLDER_YAW),
+      (self._goal, goal, BOX_YAW),
+    ):
+      half = rng.uniform(-spread, spread, count) / 2
+      pos[:, index, :2] = spot
+      quat[:, index, 0], quat[:, index, 3] = np.cos(half), np.sin(half)
+    qpos[:, self._plate : self._plate + 2] = holder
+    # Turned about the vertical after being put on its edge by a quarter turn about y.
+    c, s = quat[:, self._holder, 0], quat[:, self._holder, 3]
+    standing = np.stack([c, -s, c, s], -1) / np.sqrt(2)
+    qpos[:, self._plate + 3 : self._plate + 7] = standing
+    return qpos, pos, quat
+
+  def tool_targets(
+    self, state: PhysicsState, kinematics: Kinematics
+  ) -> tuple[Array, Array]:
+    """See ``Task.tool_targets``."""
+    tool = kinematics.site_xpos[:, self.scene.tool_site]
+    plate, goal = self._plate_pos(state), state.mocap_pos[:, self._goal]
+    edge = self._edge(state)
+    twist = self._hand.twist(kinematics, self._plate_yaw(state), np.pi)
+    held = self._hand.holds(state, kinematics, edge)
+    stay = held | self._hand.around(kinematics, edge, twist)
+    rise = geometry.up(tool[:, :2], TRAVEL)
+    low = tool[:, 2] < TRAVEL - 0.02
+
+    off = geometry.norm(tool[:, :2] - edge[:, :2])
+    leave = ((off > FUNNEL) & low & ~held)[:, None]
+    off = off + LEVER * jnp.abs(twist)
+    height = geometry.funnel(off, aligned=ALIGNED, wide=FUNNEL)
+    height = HOVER * jnp.where(stay | self._hand.is_open(state), height, 1.0)
+    grasp = geometry.up(edge[:, :2], edge[:, 2] - self._hand.depth + height)
+    to_object = jnp.where(leave, rise, grasp)
+
+    shift = goal - plate
+    far = geometry.funnel(geometry.norm(shift[:, :2]), aligned=ALIGNED / 2, wide=FUNNEL)
+    climb = RADIUS + 0.003 + LIFT * far - plate[:, 2]
+    free = ((plate[:, 2] - RADIUS - 0.005) / (FREE - 0.005)).clip(0.0, 1.0)
+    free = jnp.maximum(free, 1.0 - far)  # Close to its place it may be low.
+    carry = tool + geometry.up(free[:, None] * shift[:, :2], climb)
+    leave = ((geometry.norm(tool[:, :2] - goal[:, :2]) > FUNNEL) & low)[:, None]
+    empty = jnp.where(leave, rise, geometry.up(goal[:, :2], TRAVEL))
+    to_goal = jnp.where(held[:, None], carry, empty)
+
+    positions = jnp.stack(
+      [to_object, to_goal, jnp.broadcast_to(self._neutral_pos, to_goal.shape)], 1
+    )
+    box_yaw = geometry.yaw(state.mocap_quat[:, self._goal])
+    # A plate that is still in its holder must not be turned.
+    turn = jnp.where(held & (free < 1), self._plate_yaw(state), box_yaw)
+    turns = jnp.stack([self._plate_yaw(state), turn, 0 * turn], 1)
+    return positions, geometry.turn_z(turns) @ self._neutral_mat
+
+  def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:
+    """The plate is in the box, on its floor, at rest, and the gripper has let go."""
+    speed = geometry.norm(state.qvel[:, self._plate_dof : self._plate_dof + 3])
+    distance = geometry.norm(self._hand.point(kinematics) - self._edge(state))
+    return self._in_box(state) & (speed < REST_SPEED) & (distance > CLEAR)
+
+  def objects(self, state: PhysicsState) -> Array:
+    """f32[worlds, 12]: centre of the plate and a point 5 cm along its axis, the same
+    for the box and its longer side, m."""
+    plate, goal = self._plate_pos(state), state.mocap_pos[:, self._goal]
+    box_yaw = geometry.yaw(state.mocap_quat[:, self._goal])
+    along = jnp.stack([jnp.cos(box_yaw), jnp.sin(box_yaw), 0 * box_yaw], -1)
+    return jnp.concatenate(
+      [plate, plate + 0.05 * self._axis(state), goal, goal + 0.05 * along], -1
+    )
+
+  def expert(
+    self, state: PhysicsState, kinematics: Kinematics, primitives: Array
+  ) -> Array:
+    """Pick the plate by its edge, place it in the box."""
+    edge = self._edge(state)
+    twist = self._hand.twist(kinematics, self._plate_yaw(state), np.pi)
+    return pick_and_place(
+      primitives,
+      around=self._hand.around(kinematics, edge, twist),
+      held=self._hand.holds(state, kinematics, edge),
+      done=self._in_box(state),
+      is_open=self._hand.is_open(state),
+    )
+
+  def _plate_pos(self, state: PhysicsState) -> Array:
+    return state.qpos[:, self._plate : self._plate + 3]
+
+  def _axis(self, state: PhysicsState) -> Array:
+    """The plate's axis, the third column of its rotation."""
+    w, x, y, z = jnp.moveaxis(state.qpos[:, self._plate + 3 : self._plate + 7], -1, 0)
+    return jnp.stack(
+      [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x**2 + y**2)], -1
+    )
+
+  def _plate_yaw(self, state: PhysicsState) -> Array:
+    """Heading of the plate's axis, which has no sign; 0 if it lies flat."""
+    axis = self._axis(state)
+    return geometry.fold(jnp.arctan2(axis[:, 1], axis[:, 0] + 1e-9), np.pi)
+
+  def _edge(self, state: PhysicsState) -> Array:
+    """Where the pads shall meet the plate: below the top of its edge."""
+    axis = self._axis(state)
+    slope = geometry.up(0 * axis[:, :2], 1.0) - axis[:, 2:] * axis
+    top = slope / jnp.maximum(geometry.norm(slope), 0.1)[:, None]
+    return self._plate_pos(state) + (RADIUS - GRASP_INSET) * top
+
+  def _in_box(self, state: PhysicsState) -> Array:
+    """The plate's centre is between the walls and its lowest point at the floor."""
+    mat = geometry.turn_z(geometry.yaw(state.mocap_quat[:, self._goal]))
+    shift = self._plate_pos(state) - state.mocap_pos[:, self._goal]
+    local = jnp.einsum("wji,wj->wi", mat, shift)
+    tilt = self._axis(state)[:, 2]
+    lowest = shift[:, 2] - RADIUS * jnp.sqrt(1 - tilt.clip(-1, 1) ** 2)
+    between = (jnp.abs(local[:, :2]) < jnp.asarray(INSIDE)).all(-1)
+    return between & (lowest < ON_FLOOR)

@@ -1,0 +1,198 @@
+"""Stacking box: put the yellow box on the blue one and let go.
+
+Primitives, so that following one of them never knocks a box over:
+
+- object: go above the yellow box, turn the fingers to its faces and, through a
+  funnel, down until it is between the open pads; stay there.
+- goal: with the box in hand, lift it over the blue one and, through a funnel, down
+  onto it; with empty hands, go above the blue box.
+- neutral: the configuration of the keyframe.
+
+A low tool that is not at a box rises first; fingers that are closed on nothing do not
+descend.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from apnpql_jax.presets import mjcf_path
+from apnpql_jax.sim import arm
+from apnpql_jax.sim.kinematics import Kinematics
+from apnpql_jax.sim.physics import PhysicsState
+from apnpql_jax.sim.scene import load_scene
+from apnpql_jax.tasks import geometry
+from apnpql_jax.tasks.pinch import Pinch, pick_and_place
+from apnpql_jax.tasks.task import ResetDraw, register
+from apnpql_jax.types import Array
+
+WORKSPACE = ((0.38, 0.56), (-0.22, 0.22))
+"""m; x and y ranges of both boxes, within reach of a vertical tool."""
+
+MAX_YAW = 0.35
+"""rad; boxes are turned by at most this."""
+
+MIN_DISTANCE = 0.13
+"""m between the boxes: the open fingers (107 mm) around one clear the other."""
+
+ARM_NOISE = 0.15
+"""rad; uniform spread of the initial joint angles around the neutral ones."""
+
+SIDE = 0.05
+"""m; edge of a box."""
+
+ALIGNED, FUNNEL = 0.012, 0.05
+"""m; the tool descends fully within the first, stays up beyond the second."""
+
+LEVER = 0.05
+"""m/rad; how much a twist of the fingers counts as being off."""
+
+HOVER = 0.07
+"""m; height over the grasp at which the open finger tips clear the box."""
+
+TRAVEL = 0.14
+"""m; tool height at which closed fingers clear everything."""
+
+LIFT = 0.05
+"""m; clearance of the carried box over the blue one."""
+
+STACKED_OFF = 0.02
+"""m; success needs the centres this close: less than half a side, so it stands."""
+
+STACKED_HEIGHT = 0.005
+"""m; tolerance of the height difference of one side."""
+
+REST_SPEED = 0.05
+"""m/s; above float32 contact noise."""
+
+CLEAR = 0.05
+"""m; the gripper has let go when the tool is this far from the box."""
+
+
+@register("stack_box")
+class StackBox:
+  """See the module's docstring; implements ``tasks.task.Task``."""
+
+  name = "stack_box"
+
+  def __init__(self):
+    self.scene = load_scene(mjcf_path("stack_box"), cameras=("global", "wrist"))
+    self._yellow, self._yellow_dof = self.scene.free_joint("yellow")
+    self._blue, self._blue_dof = self.scene.free_joint("blue")
+    self._neutral_qpos = self.scene.keyframe("neutral")
+    chain = arm.make_chain(self.scene)
+    neutral = jnp.asarray(self._neutral_qpos[self.scene.arm_qpos], jnp.float32)
+    self._neutral_pos, self._neutral_mat, _ = arm.forward(chain, neutral)
+    # Four millimetres above the centre, for room between fingers and table.
+    self._hand = Pinch(self.scene, self._neutral_mat, width=SIDE, above=0.004)
+
+  def sample_resets(self, rng: np.random.Generator, count: int) -> ResetDraw:
+    """See ``Task.sample_resets``."""
+    low, high = np.array(WORKSPACE).T
+    yellow, blue = rng.uniform(low, high, (2, count, 2))
+    while (near := np.linalg.norm(yellow - blue, axis=-1) < MIN_DISTANCE).any():
+      blue[near] = rng.uniform(low, high, (int(near.sum()), 2))
+    qpos = np.tile(self._neutral_qpos, (count, 1))
+    qpos[:, self.scene.arm_qpos] += rng.uniform(-ARM_NOISE, ARM_NOISE, (count, 6))
+    for address, spot in ((self._yellow, yellow), (self._blue, blue)):
+      half = rng.uniform(-MAX_YAW, MAX_YAW, count) / 2
+      qpos[:, address : address + 2] = spot
+      qpos[:, address + 3], qpos[:, address + 6] = np.cos(half), np.sin(half)
+    nothing = np.zeros((count, 0, 3)), np.zeros((count, 0, 4))
+    return qpos, *nothing
+
+  def tool_targets(
+    self, state: PhysicsState, kinematics: Kinematics
+  ) -> tuple[Array, Array]:
+    """See ``Task.tool_targets``."""
+    tool = kinematics.site_xpos[:, self.scene.tool_site]
+    yellow, blue = self._yellow_pos(state), self._blue_pos(state)
+    yellow_yaw, blue_yaw = self._yaw(state, self._yellow), self._yaw(state, self._blue)
+    twist = self._hand.twist(kinematics, yellow_yaw, np.pi / 2)
+    held = self._hand.holds(state, kinematics, yellow)
+    stay = held | self._hand.around(kinematics, yellow, twist)
+    rise = geometry.up(tool[:, :2], TRAVEL)
+    low = (tool[:, 2] < TRAVEL - 0.03)[:, None]
+
+    off = geometry.norm(tool[:, :2] - yellow[:, :2])
+    leave = (off > FUNNEL)[:, None] & low & ~held[:, None]
+    off = off + LEVER * jnp.abs(twist)
+    height = geometry.funnel(off, aligned=ALIGNED, wide=FUNNEL)
+    height = HOVER * jnp.where(stay | self._hand.is_open(state), height, 1.0)
+    grasp = geometry.up(yellow[:, :2], yellow[:, 2] - self._hand.depth + height)
+    to_object = jnp.where(leave, rise, grasp)
+
+    shift = blue - yellow
+    over = geometry.funnel(
+      geometry.norm(shift[:, :2]), aligned=ALIGNED / 2, wide=FUNNEL
+    )
+    onto = tool + shift + geometry.up(0 * shift[:, :2], SIDE + 0.001 + LIFT * over)
+    above = geometry.up(blue[:, :2], TRAVEL)
+    off_blue = geometry.norm(tool[:, :2] - blue[:, :2])
+    empty = jnp.where((off_blue > FUNNEL)[:, None] & low, rise, above)
+    to_goal = jnp.where(held[:, None], onto, empty)
+
+    positions = jnp.stack(
+      [to_object, to_goal, jnp.broadcast_to(self._neutral_pos, to_goal.shape)], 1
+    )
+    turns = jnp.stack([yellow_yaw, blue_yaw, 0 * blue_yaw], 1)
+    return positions, geometry.turn_z(turns) @ self._neutral_mat
+
+  def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:
+    """Yellow stands on blue, both at rest, and the gripper has let go."""
+    yellow, blue = self._yellow_pos(state), self._blue_pos(state)
+    stacked = self._stacked(state, STACKED_OFF, STACKED_HEIGHT)
+    on_table = blue[:, 2] < 0.6 * SIDE
+    speeds = [
+      geometry.norm(state.qvel[:, dof : dof + 3])
+      for dof in (self._yellow_dof, self._blue_dof)
+    ]
+    at_rest = jnp.maximum(*speeds) < REST_SPEED
+    tool = kinematics.site_xpos[:, self.scene.tool_site]
+    return stacked & on_table & at_rest & (geometry.norm(tool - yellow) > CLEAR)
+
+  def objects(self, state: PhysicsState) -> Array:
+    """f32[worlds, 12]: for yellow and blue, xyz of centre and of a face's centre, m.
+
+    The face is the one nearest to the world's x axis: boxes look the same after a
+    quarter turn.
+    """
+    parts = []
+    for address in (self._yellow, self._blue):
+      centre = state.qpos[:, address : address + 3]
+      angle = self._yaw(state, address)
+      heading = jnp.stack([jnp.cos(angle), jnp.sin(angle), 0 * angle], -1)
+      parts += [centre, centre + SIDE / 2 * heading]
+    return jnp.concatenate(parts, -1)
+
+  def expert(
+    self, state: PhysicsState, kinematics: Kinematics, primitives: Array
+  ) -> Array:
+    """Pick the yellow box, place it on the blue one."""
+    yellow = self._yellow_pos(state)
+    heading = self._yaw(state, self._yellow)
+    twist = self._hand.twist(kinematics, heading, np.pi / 2)
+    return pick_and_place(
+      primitives,
+      around=self._hand.around(kinematics, yellow, twist),
+      held=self._hand.holds(state, kinematics, yellow),
+      done=self._stacked(state, STACKED_OFF / 2, STACKED_HEIGHT),
+      is_open=self._hand.is_open(state),
+    )
+
+  def _yellow_pos(self, state: PhysicsState) -> Array:
+    return state.qpos[:, self._yellow : self._yellow + 3]
+
+  def _blue_pos(self, state: PhysicsState) -> Array:
+    return state.qpos[:, self._blue : self._blue + 3]
+
+  def _yaw(self, state: PhysicsState, address: int) -> Array:
+    """Heading of the box's face nearest to the world's x axis."""
+    quat = state.qpos[:, address + 3 : address + 7]
+    return geometry.fold(geometry.yaw(quat), np.pi / 2)
+
+  def _stacked(self, state: PhysicsState, off: float, height: float) -> Array:
+    shift = self._yellow_pos(state) - self._blue_pos(state)
+    level = jnp.abs(shift[:, 2] - SIDE) < height
+    return level & (geometry.norm(shift[:, :2]) < off)

@@ -1,0 +1,13 @@
+"""Put a plate from its holder into a box, from pixels: the agent of push_plate."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from apnpql_jax.presets import load_preset
+
+_PUSH = load_preset("push_plate")
+
+CONFIG = dataclasses.replace(
+  _PUSH, env=dataclasses.replace(_PUSH.env, task="place_plate"), total_steps=102_400
+)
