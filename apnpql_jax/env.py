@@ -127,7 +127,11 @@ class Env:
   def _initial(self, rows: Array) -> PhysicsState:
     bank = self._bank
     return physics.initial_state(
-      self.task.scene, bank.qpos[rows], bank.mocap_pos[rows], bank.mocap_quat[rows]
+      self.task.scene,
+      bank.qpos[rows],
+      bank.mocap_pos[rows],
+      bank.mocap_quat[rows],
+      bank.variant[rows],
     )
 
   def _arrive(
@@ -142,8 +146,9 @@ class Env:
     """Judges, labels and observes the instant the worlds have come to."""
     kinematics = self._kinematics(state)
     poses = self.task.tool_targets(state, kinematics)
-    targets = tracking.refine(self._chain, targets, *poses)
     q = state.qpos[:, self.task.scene.arm_qpos]
+    present = jnp.broadcast_to(q[:, None], targets.shape)
+    targets = tracking.refine(self._chain, targets, present, *poses)
     solved = self.task.success(state, kinematics) & ~fresh
     late = (elapsed >= self.config.episode_steps) & ~fresh
     timestep = TimeStep(
@@ -192,6 +197,7 @@ def camera_renderer(scene: Scene, name: str, size: tuple[int, int]) -> Renderer:
       kinematics.cam_xpos[:, index],
       kinematics.cam_xmat[:, index],
       lighting,
+      geom_size=kinematics.geom_size,
       outputs=("rgb",),
     ).rgb
 

@@ -40,4 +40,4 @@ def engines(task: Task) -> dict[str, Callable]:
 def resets(task: Task) -> physics.PhysicsState:
   """``WORLDS`` initial states as the task draws them."""
   draw = task.sample_resets(np.random.default_rng(3), WORLDS)
-  return physics.initial_state(task.scene, *(jnp.asarray(x, jnp.float32) for x in draw))
+  return physics.initial_state(task.scene, *map(jnp.asarray, draw))

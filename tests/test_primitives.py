@@ -48,7 +48,7 @@ def test_refinement_agrees_with_mink(task, small_bank):
   position, rotation, _ = arm.forward(chain, target)
   shift = np.random.default_rng(0).uniform(-0.05, 0.05, position.shape)
   moved = position + jnp.asarray(shift, jnp.float32)
-  refined = jax.jit(tracking.refine)(chain, target, moved, rotation)
+  refined = jax.jit(tracking.refine)(chain, target, target, moved, rotation)
   for i in range(16):
     exact = solver.solve(*(np.asarray(x[i]) for x in (target, moved, rotation)))
     assert exact.reached
@@ -88,4 +88,5 @@ def test_following_reaches_a_target_without_overshoot(engines, resets, task, nam
 
 
 def _at(task, rows):
-  return physics.initial_state(task.scene, rows.qpos, rows.mocap_pos, rows.mocap_quat)
+  poses = rows.qpos, rows.mocap_pos, rows.mocap_quat
+  return physics.initial_state(task.scene, *poses, rows.variant)

@@ -36,7 +36,7 @@ def test_it_is_registered():
 def test_resets_are_unsolved_and_in_range(task, resets):
   assert not judge(task, resets).any()
   plate, _ = task.scene.free_joint("plate")
-  qpos, mocap_pos, _ = task.sample_resets(np.random.default_rng(0), 2000)
+  qpos, mocap_pos, *_ = task.sample_resets(np.random.default_rng(0), 2000)
   spots = np.stack([qpos[:, plate : plate + 2], mocap_pos[:, 0, :2]])
   low, high = np.array(push_plate.WORKSPACE).T
   assert (spots >= low).all() and (spots <= high).all()

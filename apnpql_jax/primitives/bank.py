@@ -34,7 +34,7 @@ from apnpql_jax.types import Array
 if TYPE_CHECKING:  # Tasks know the primitives, so only the type may be known here.
   from apnpql_jax.tasks.task import Task
 
-VERSION = 1
+VERSION = 2
 """Raised when the meaning of a bank changes; part of the cache key."""
 
 SEED = 0
@@ -44,6 +44,10 @@ SETTLE_PERIODS = 4
 SETTLE_SPEED = 0.05
 """m/s and rad/s; above float32 contact noise (0.04)."""
 
+MAX_TRAVEL = 2.5
+"""rad; a joint that had to turn further would pass through another branch of the arm's
+configurations on the way."""
+
 
 class ResetBank(struct.PyTreeNode):
   """Settled initial states and where their primitives lead."""
@@ -51,6 +55,7 @@ class ResetBank(struct.PyTreeNode):
   qpos: Array  # f32[rows, nq]
   mocap_pos: Array  # f32[rows, nmocap, 3]
   mocap_quat: Array  # f32[rows, nmocap, 4]
+  variant: Array  # i32[rows]: of the scene
   targets: Array  # f32[rows, 3, 6], rad
 
   @property
@@ -97,17 +102,19 @@ def build_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
   ):
     bar = progress.add_task(f"reset bank of {task.name}", total=rows)
     while (missing := rows - sum(bank.rows for bank in kept)) > 0:
-      draw = _settled(task, rng, max(missing, CHUNK), report)
+      settled = _settled(task, rng, max(missing, CHUNK), report)
       solved = _solve_targets(
-        task, draw, pool, report, lambda n: progress.advance(bar, n)
+        task, *settled, pool, report, lambda n: progress.advance(bar, n)
       )
       kept.append(jax.tree.map(lambda x: x[:missing], solved))
   return jax.tree.map(lambda *parts: jnp.concatenate(parts), *kept), report
 
 
-def _settled(task: Task, rng, count: int, report: BankReport) -> physics.PhysicsState:
-  """States that stay where they are while the arm holds still."""
-  draw = [jnp.asarray(x, jnp.float32) for x in task.sample_resets(rng, count)]
+def _settled(
+  task: Task, rng, count: int, report: BankReport
+) -> tuple[physics.PhysicsState, Array]:
+  """States that stay where they are while the arm holds still, and their variants."""
+  draw = jax.tree.map(jnp.asarray, task.sample_resets(rng, count))
   state = physics.initial_state(task.scene, *draw)
   engine = NativePhysics(task.scene, substeps=30)
   closed = state.qpos[:, task.scene.gripper_qpos] > 0.5
@@ -116,10 +123,12 @@ def _settled(task: Task, rng, count: int, report: BankReport) -> physics.Physics
   restless = np.abs(np.asarray(state.qvel)).max(-1) > SETTLE_SPEED
   report.drawn += count
   report.rejected_restless += int(restless.sum())
-  return jax.tree.map(lambda x: x[~restless], state)
+  return jax.tree.map(lambda x: x[~restless], (state, draw.variant))
 
 
-def _solve_targets(task, state, pool, report: BankReport, advance) -> ResetBank:
+def _solve_targets(
+  task, state, variant, pool, report: BankReport, advance
+) -> ResetBank:
   kinematics = jax.jit(make_kinematics(task.scene))(state)
   positions, rotations = map(np.asarray, task.tool_targets(state, kinematics))
   starts = np.asarray(state.qpos[:, task.scene.arm_qpos])
@@ -134,6 +143,7 @@ def _solve_targets(task, state, pool, report: BankReport, advance) -> ResetBank:
     for parts in zip(*[future.result() for future in futures], strict=True)
   )
   reached = (residuals < [ik.POSITION_TOLERANCE, ik.ROTATION_TOLERANCE]).all((1, 2))
+  reached &= np.abs(targets - starts[:, None]).max((1, 2)) < MAX_TRAVEL
   report.rejected_unreachable += int((~reached).sum())
   worst = residuals[reached].max((0, 1))
   report.max_position_residual = max(report.max_position_residual, float(worst[0]))
@@ -142,6 +152,7 @@ def _solve_targets(task, state, pool, report: BankReport, advance) -> ResetBank:
     qpos=state.qpos[reached],
     mocap_pos=state.mocap_pos[reached],
     mocap_quat=state.mocap_quat[reached],
+    variant=variant[reached],
     targets=jnp.asarray(targets[reached], jnp.float32),
   )
 
@@ -169,9 +180,13 @@ def _cache_path(task: Task, rows: int) -> pathlib.Path:
 
 
 def _source(task: Task) -> str:
-  """The task's own file: its ranges and tool targets decide what a bank holds."""
-  path = pathlib.Path(inspect.getfile(type(task)))
-  return hashlib.sha256(path.read_bytes()).hexdigest()
+  """Hash of the task's file and of what tasks share: they decide what a bank holds."""
+  own = pathlib.Path(inspect.getfile(type(task)))
+  digest = hashlib.sha256(own.read_bytes())
+  for path in sorted(own.parent.glob("*.py")):
+    if "\n@register(" not in (text := path.read_text(encoding="utf-8")):
+      digest.update(text.encode())
+  return digest.hexdigest()
 
 
 def _store(path: pathlib.Path, bank: ResetBank, report: BankReport) -> None:

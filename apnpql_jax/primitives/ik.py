@@ -19,6 +19,9 @@ POSITION_TOLERANCE = 1e-3
 """m; residual above which a target counts as unreachable."""
 ROTATION_TOLERANCE = np.deg2rad(0.5)
 """rad; likewise."""
+MAX_STEP = 0.3
+"""rad; longest step of a joint in one iteration."""
+
 POSTURE_COST = 1e-4
 """Against position and orientation costs of 1: decides only the null space and, at
 unreachable poses, keeps the arm near its start."""
@@ -84,5 +87,7 @@ class IkSolver:
         damping=1e-9,
         limits=self._limits,
       )
-      configuration.integrate_inplace(velocity, 1.0)
+      # Longer steps would leap over to another branch of the arm's configurations.
+      longest = max(float(np.abs(velocity).max()), 1e-9)
+      configuration.integrate_inplace(velocity, min(1.0, MAX_STEP / longest))
     return IkResult(configuration.q[: len(start)].copy(), *map(float, residuals))

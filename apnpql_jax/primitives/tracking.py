@@ -49,12 +49,19 @@ def follow(target: Array, q: Array) -> Array:
   return error * (speed / jnp.maximum(farthest, 1e-6))
 
 
-def refine(chain: arm.ArmChain, q: Array, pos: Array, mat: Array) -> Array:
+def refine(
+  chain: arm.ArmChain, last: Array, present: Array, pos: Array, mat: Array
+) -> Array:
   """Moves joint targets towards tool poses by damped least squares.
+
+  Starts from the last target, or from the present configuration where that is nearer
+  to the pose: after a jump of the pose, such as when an object has been grasped, the
+  steps from afar could end in another branch of the arm's configurations.
 
   Args:
     chain: the arm.
-    q: f32[*b, 6], start, rad.
+    last: f32[*b, 6], rad.
+    present: f32[*b, 6], rad.
     pos: f32[*b, 3], desired tool position, m.
     mat: f32[*b, 3, 3], desired tool rotation.
 
@@ -63,14 +70,19 @@ def refine(chain: arm.ArmChain, q: Array, pos: Array, mat: Array) -> Array:
   """
   damping = DAMPING**2 * jnp.eye(6)
 
-  def newton_step(q: Array, _) -> tuple[Array, None]:
+  def error(q: Array) -> tuple[Array, Array]:
     tool_pos, tool_mat, jacobian = arm.forward(chain, q)
-    error = jnp.concatenate(
-      [pos - tool_pos, arm.rotation_error(tool_mat, mat)], axis=-1
-    )
+    turn = arm.rotation_error(tool_mat, mat)
+    return jnp.concatenate([pos - tool_pos, turn], axis=-1), jacobian
+
+  def newton_step(q: Array, _) -> tuple[Array, None]:
+    missing, jacobian = error(q)
     transposed = jnp.swapaxes(jacobian, -1, -2)
     gram = jacobian @ transposed + damping
-    step = transposed @ jnp.linalg.solve(gram, error[..., None])
-    return q + step[..., 0].clip(-MAX_REFINEMENT, MAX_REFINEMENT), None
+    step = (transposed @ jnp.linalg.solve(gram, missing[..., None]))[..., 0]
+    longest = jnp.abs(step).max(-1, keepdims=True)
+    return q + step * jnp.minimum(1.0, MAX_REFINEMENT / (longest + 1e-9)), None
 
-  return jax.lax.scan(newton_step, q, length=REFINE_STEPS)[0]
+  far = [(error(q)[0] ** 2).sum(-1, keepdims=True) for q in (last, present)]
+  start = jnp.where(far[0] <= far[1], last, present)
+  return jax.lax.scan(newton_step, start, length=REFINE_STEPS)[0]

@@ -54,6 +54,7 @@ def render(
   cam_xmat: Array,
   lighting: Lighting = DEFAULT_LIGHTING,
   *,
+  geom_size: Array | None = None,
   outputs: Sequence[str] = OUTPUTS,
   near: float = NEAR,
 ) -> Image:
@@ -70,6 +71,7 @@ def render(
     cam_xpos: f32[*b, 3], world position of this camera.
     cam_xmat: f32[*b, 3, 3], world rotation of this camera.
     lighting: light, background, shadows.
+    geom_size: f32[*b, ngeom, 3], MuJoCo half sizes in m; those of ``geoms`` if None.
     outputs: which of "rgb", "depth", "segmentation" to compute; only these are paid.
     near: smallest depth drawn, in metres.
 
@@ -90,9 +92,10 @@ def render(
       raise ValueError(f"poses do not fit together: {[p.shape for p in poses]}")
   one = functools.partial(_render_one, geoms, camera, lighting, tuple(outputs), near)
   if not batch:
-    return one(*poses)
+    return one(*poses, geom_size)
   flat = [p.reshape(-1, *t) for p, t in zip(poses, tails, strict=True)]
-  image = jax.vmap(one)(*flat)
+  sizes = None if geom_size is None else geom_size.reshape(-1, *geom_size.shape[-2:])
+  image = jax.vmap(one)(*flat, sizes)
   return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), image)
 
 
@@ -106,6 +109,7 @@ def _render_one(
   geom_xmat: Array,
   cam_xpos: Array,
   cam_xmat: Array,
+  geom_size: Array | None,
 ) -> Image:
   """One image; arguments as of ``render``, without leading axes."""
   to_camera = cam_xmat[None, :, :]
@@ -113,7 +117,8 @@ def _render_one(
   axes = (to_camera[..., None] * geom_xmat[geoms.ids][:, :, None, :]).sum(axis=1)
   basis = jnp.asarray(shadow.light_basis(lighting.direction))
   basis = (basis[:, :, None] * to_camera).sum(axis=1)
-  frames = intersect.prepare(center, axes, geoms.sizes, basis[2])
+  sizes = geoms.sizes if geom_size is None else geom_size[geoms.ids]
+  frames = intersect.prepare(center, axes, sizes, basis[2])
 
   blocks = _blocks(camera)
   cast = functools.partial(_cast, geoms, lighting, frames, basis, near)

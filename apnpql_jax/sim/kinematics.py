@@ -15,7 +15,7 @@ from apnpql_jax.types import Array
 
 
 class Kinematics(struct.PyTreeNode):
-  """World poses of what can be seen or measured, by MuJoCo id."""
+  """World poses of what can be seen or measured, by MuJoCo id, m."""
 
   geom_xpos: Array  # f32[*b, ngeom, 3]
   geom_xmat: Array  # f32[*b, ngeom, 3, 3]
@@ -23,6 +23,7 @@ class Kinematics(struct.PyTreeNode):
   site_xmat: Array  # f32[*b, nsite, 3, 3]
   cam_xpos: Array  # f32[*b, ncam, 3]
   cam_xmat: Array  # f32[*b, ncam, 3, 3]
+  geom_size: Array | None  # f32[*b, ngeom, 3]; None if the same in all worlds
 
 
 def make_kinematics(scene: Scene) -> Callable[[PhysicsState], Kinematics]:
@@ -31,9 +32,10 @@ def make_kinematics(scene: Scene) -> Callable[[PhysicsState], Kinematics]:
   model = mjx.put_model(scene.model, impl="jax")
   template = mjx.make_data(scene.model, impl="jax")
 
-  def single(qpos, mocap_pos, mocap_quat) -> Kinematics:
+  def single(qpos, mocap_pos, mocap_quat, fields) -> Kinematics:
+    world = model.replace(**fields)
     data = template.replace(qpos=qpos, mocap_pos=mocap_pos, mocap_quat=mocap_quat)
-    data = mjx.camlight(model, mjx.kinematics(model, data))
+    data = mjx.camlight(world, mjx.kinematics(world, data))
     return Kinematics(
       geom_xpos=data.geom_xpos,
       geom_xmat=data.geom_xmat,
@@ -41,10 +43,11 @@ def make_kinematics(scene: Scene) -> Callable[[PhysicsState], Kinematics]:
       site_xmat=data.site_xmat,
       cam_xpos=data.cam_xpos,
       cam_xmat=data.cam_xmat,
+      geom_size=fields.get("geom_size"),
     )
 
   def kinematics(state: PhysicsState) -> Kinematics:
-    return jax.vmap(single)(state.qpos, state.mocap_pos, state.mocap_quat)
+    return jax.vmap(single)(state.qpos, state.mocap_pos, state.mocap_quat, state.fields)
 
   return kinematics
 

@@ -42,6 +42,7 @@ class MjxPhysics:
     return jax.vmap(self._step_world)(state, velocity, close)
 
   def _step_world(self, state, velocity, close):
+    model = self._model.replace(**state.fields)
     data = self._template.replace(
       qpos=state.qpos,
       qvel=state.qvel,
@@ -52,7 +53,7 @@ class MjxPhysics:
     )
 
     def substep(carry, _):
-      return self._substep(carry, velocity, close), None
+      return self._substep(model, carry, velocity, close), None
 
     data, _ = jax.lax.scan(substep, data, length=self._substeps)
     return state.replace(
@@ -62,10 +63,10 @@ class MjxPhysics:
       time=data.time,
     )
 
-  def _substep(self, data, velocity, close):
+  def _substep(self, model, data, velocity, close):
     # mjx.step with the control between its velocity and actuation stages, so that
     # mass matrix and bias are those of the present state and computed only once.
-    model, arm = self._model, self.scene.arm_dof
+    arm = self.scene.arm_dof
     data = mjx.fwd_velocity(model, mjx.fwd_position(model, data))
     torque = physics.arm_torque(
       mjx.full_m(model, data)[arm][:, arm],

@@ -64,6 +64,8 @@ class NativePhysics:
       batch = self._batch(velocity.shape[0])
       for name in _STATE_FIELDS:
         getattr(batch, name)[...] = np.asarray(getattr(state, name))
+      for name, value in state.fields.items():
+        batch.expand(name)[...] = np.asarray(value)
       self._advance(batch, np.asarray(velocity), np.asarray(close))
       fields = {
         name: np.asarray(getattr(batch, name), np.float32) for name in _STATE_FIELDS

@@ -51,6 +51,7 @@ class PhysicsState(struct.PyTreeNode):
   mocap_pos: Array  # f32[*b, nmocap, 3]
   mocap_quat: Array  # f32[*b, nmocap, 4]
   time: Array  # f32[*b], s since the reset
+  fields: dict[str, Array]  # model fields that differ between worlds, [*b, ...]
 
 
 class Physics(Protocol):
@@ -90,7 +91,7 @@ def make_physics(name: str, scene: Scene, *, substeps: int) -> Physics:
 
 
 def initial_state(
-  scene: Scene, qpos: Array, mocap_pos: Array, mocap_quat: Array
+  scene: Scene, qpos: Array, mocap_pos: Array, mocap_quat: Array, variant: Array
 ) -> PhysicsState:
   """A state at rest.
 
@@ -99,6 +100,7 @@ def initial_state(
     qpos: f32[*b, nq].
     mocap_pos: f32[*b, nmocap, 3].
     mocap_quat: f32[*b, nmocap, 4].
+    variant: i32[*b], which of the scene's variants each world is.
   """
   batch = qpos.shape[:-1]
   model = scene.model
@@ -109,6 +111,7 @@ def initial_state(
     mocap_pos=mocap_pos,
     mocap_quat=mocap_quat,
     time=jnp.zeros(batch),
+    fields={k: jnp.asarray(v)[variant] for k, v in scene.variants.items()},
   )
 
 

@@ -6,12 +6,13 @@ site and wrist camera. Look-ups fail early and name what exists.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 import dataclasses
 import hashlib
 import pathlib
 
 import mujoco
+from mujoco import mjx
 import numpy as np
 
 from apnpql_jax.config import ConfigError
@@ -42,6 +43,8 @@ class Scene:
     gripper_dof: address of the driven finger joint in qvel.
     tool_site: site id of the tool point between the closed finger tips.
     cameras: names of the cameras found.
+    variants: model fields that differ between the variants of the scene, and their
+      values f32[variants, ...]; empty if there is only one.
   """
 
   name: str
@@ -53,6 +56,7 @@ class Scene:
   gripper_dof: int
   tool_site: int
   cameras: tuple[str, ...]
+  variants: dict[str, np.ndarray]
 
   def id(self, kind: str, name: str) -> int:
     """Id of a named object of ``kind`` ("body", "site", "camera", "geom", "key").
@@ -82,22 +86,26 @@ class Scene:
     return self.model.key_qpos[self.id("key", name)].copy()
 
 
-def load_scene(path: pathlib.Path, *, cameras: Sequence[str] = ()) -> Scene:
+def load_scene(
+  path: pathlib.Path,
+  *,
+  cameras: Sequence[str] = (),
+  variants: Sequence[Callable[[mujoco.MjSpec], None]] = (),
+) -> Scene:
   """Compiles ``path`` and checks it.
 
   Args:
     path: an MJCF file that includes the robot.
     cameras: camera names that must exist.
+    variants: each makes another scene of the same structure by editing the parsed
+      file, such as one more shape of an object. A world can then be any of them.
 
   Raises:
     ConfigError: the file does not compile, lacks a joint, site or camera, or
       uses a feature that MJX would silently ignore.
   """
-  try:
-    model = mujoco.MjModel.from_xml_path(str(path))
-  except ValueError as error:
-    reason = str(error).splitlines()[0]
-    raise ConfigError(f"{path.name} does not compile: {reason}") from error
+  models = [_compile(path, edit) for edit in variants] or [_compile(path)]
+  model = models[0]
   refuse_unsupported(model, path.stem)
   joints = [_named_id(model, path.stem, "joint", name) for name in ARM_JOINTS]
   finger = _named_id(model, path.stem, "joint", GRIPPER_JOINT)
@@ -106,13 +114,14 @@ def load_scene(path: pathlib.Path, *, cameras: Sequence[str] = ()) -> Scene:
   return Scene(
     name=path.stem,
     model=model,
-    fingerprint=_fingerprint(model),
+    fingerprint=_fingerprint(models),
     arm_qpos=model.jnt_qposadr[joints].copy(),
     arm_dof=model.jnt_dofadr[joints].copy(),
     gripper_qpos=int(model.jnt_qposadr[finger]),
     gripper_dof=int(model.jnt_dofadr[finger]),
     tool_site=_named_id(model, path.stem, "site", TOOL_SITE),
     cameras=tuple(model.camera(i).name for i in range(model.ncam)),
+    variants=_differences(models),
   )
 
 
@@ -159,7 +168,38 @@ def _named_id(model: mujoco.MjModel, scene: str, kind: str, name: str) -> int:
     raise ConfigError(f"{scene}.xml has no {kind} '{name}' (valid: {valid})") from None
 
 
-def _fingerprint(model: mujoco.MjModel) -> str:
-  buffer = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
-  mujoco.mj_saveModel(model, None, buffer)
-  return hashlib.sha256(buffer.tobytes()).hexdigest()
+def _compile(
+  path: pathlib.Path, edit: Callable[[mujoco.MjSpec], None] | None = None
+) -> mujoco.MjModel:
+  try:
+    spec = mujoco.MjSpec.from_file(str(path))
+    if edit is not None:
+      edit(spec)
+    return spec.compile()
+  except ValueError as error:
+    reason = str(error).splitlines()[0]
+    raise ConfigError(f"{path.name} does not compile: {reason}") from error
+
+
+def _differences(models: Sequence[mujoco.MjModel]) -> dict[str, np.ndarray]:
+  """The fields in which the models differ, of those that MJX has too.
+
+  What C MuJoCo has beyond them serves collision filters that explicit pairs bypass.
+  """
+  differences = {}
+  for field in dataclasses.fields(mjx.Model):
+    values = [getattr(model, field.name, None) for model in models]
+    if not isinstance(values[0], np.ndarray) or values[0].dtype.kind != "f":
+      continue
+    if any(not np.array_equal(values[0], value) for value in values):
+      differences[field.name] = np.stack(values).astype(np.float32)
+  return differences
+
+
+def _fingerprint(models: Sequence[mujoco.MjModel]) -> str:
+  digest = hashlib.sha256()
+  for model in models:
+    buffer = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    digest.update(buffer.tobytes())
+  return digest.hexdigest()

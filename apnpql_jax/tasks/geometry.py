@@ -21,6 +21,17 @@ def yaw(quat: Array) -> Array:
   return jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
 
 
+def axis(quat: Array, index: int) -> Array:
+  """One axis of a rotated frame, f32[*b, 4] (wxyz) -> f32[*b, 3]."""
+  w, x, y, z = jnp.moveaxis(quat, -1, 0)
+  columns = (
+    (1 - 2 * (y**2 + z**2), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+    (2 * (x * y - w * z), 1 - 2 * (x**2 + z**2), 2 * (y * z + w * x)),
+    (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x**2 + y**2)),
+  )
+  return jnp.stack(columns[index], -1)
+
+
 def fold(angle: Array, period: float) -> Array:
   """The equivalent angle nearest to zero of a shape that repeats every ``period``."""
   return angle - period * jnp.round(angle / period)

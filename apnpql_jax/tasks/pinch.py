@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-import numpy as np
 
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import FINGER_ANGLE, FINGER_LENGTH, PhysicsState
@@ -13,6 +12,9 @@ from apnpql_jax.types import Array
 
 TOLERANCE = 0.004
 """m; how far the pads' gap may be from an object's width while they hold it."""
+
+CLEARANCE = 0.02
+"""m; an open hand leaves this much, both sides together."""
 
 NEAR = 0.01
 """m; the hand may close when its pinch point is this close to where it shall grip."""
@@ -38,11 +40,9 @@ class Pinch:
       width: m, of what is gripped.
       above: m, distance along the tool from where it is aimed at to the pads' centre.
     """
-    self._scene, self._neutral_mat = scene, neutral_mat
-    self.depth = pinch_height(width) - above
+    self._scene, self._neutral_mat, self._width = scene, neutral_mat, width
+    self.depth = float(pinch_height(width)) - above
     """m from the tool site back to the point that is aimed at what is gripped."""
-    self._closed = finger_angle(width + TOLERANCE), finger_angle(width - TOLERANCE)
-    self._open = finger_angle(width + 0.025)
 
   def point(self, kinematics: Kinematics) -> Array:
     """f32[worlds, 3]: where the gripped point of an object in the hand is, m."""
@@ -57,12 +57,11 @@ class Pinch:
 
   def is_open(self, state: PhysicsState) -> Array:
     """bool[worlds]: the pads are clear of the object on both sides."""
-    return state.qpos[:, self._scene.gripper_qpos] < self._open
+    return is_open(self._scene, state, self._width)
 
   def holds(self, state: PhysicsState, kinematics: Kinematics, point: Array) -> Array:
     """bool[worlds]: the pads grip something of this width, at ``point`` (m)."""
-    angle = state.qpos[:, self._scene.gripper_qpos]
-    gripping = (angle > self._closed[0]) & (angle < self._closed[1])
+    gripping = is_gripping(self._scene, state, self._width)
     return gripping & (geometry.norm(self.point(kinematics) - point) < LOST)
 
   def around(self, kinematics: Kinematics, point: Array, twist: Array) -> Array:
@@ -72,7 +71,13 @@ class Pinch:
 
 
 def pick_and_place(
-  primitives: Array, *, around: Array, held: Array, done: Array, is_open: Array
+  primitives: Array,
+  *,
+  around: Array,
+  held: Array,
+  done: Array,
+  is_open: Array,
+  withdraw: int = 2,
 ) -> Array:
   """Reach, close, carry, open, withdraw: the scripted expert of such tasks.
 
@@ -82,27 +87,40 @@ def pick_and_place(
     held: bool[worlds], the object is in the hand.
     done: bool[worlds], the object is where it shall be let go.
     is_open: bool[worlds], the hand has let go.
+    withdraw: which primitive leads the open hand away.
 
   Returns:
     f32[worlds, 7].
   """
   # While the fingers open, stay with the object.
-  choice = jnp.where(done, jnp.where(is_open, 2, 0), jnp.where(held, 1, 0))
+  choice = jnp.where(done, jnp.where(is_open, withdraw, 0), jnp.where(held, 1, 0))
   velocity = jnp.take_along_axis(primitives, choice[:, None, None], axis=1)[:, 0]
   close = (held | around) & ~done
   return jnp.concatenate([velocity, close[:, None].astype(velocity.dtype)], -1)
 
 
-def finger_angle(gap: float) -> float:
+def is_open(scene: Scene, state: PhysicsState, width: Array | float) -> Array:
+  """bool[worlds]: the pads are clear of something ``width`` (m) wide, on both sides."""
+  return state.qpos[:, scene.gripper_qpos] < finger_angle(width + CLEARANCE)
+
+
+def is_gripping(scene: Scene, state: PhysicsState, width: Array | float) -> Array:
+  """bool[worlds]: the fingers have closed to ``width`` (m) and no further."""
+  angle = state.qpos[:, scene.gripper_qpos]
+  low, high = finger_angle(width + TOLERANCE), finger_angle(width - TOLERANCE)
+  return (angle > low) & (angle < high)
+
+
+def finger_angle(gap: Array | float) -> Array:
   """Angle of the driven finger (rad) at which the pads are ``gap`` (m) apart."""
-  return float(np.arccos((gap / 2 - 0.0041) / FINGER_LENGTH) - FINGER_ANGLE)
+  return jnp.arccos((gap / 2 - 0.0041) / FINGER_LENGTH) - FINGER_ANGLE
 
 
-def pinch_height(gap: float) -> float:
+def pinch_height(gap: Array | float) -> Array:
   """How far (m) the pads' centre lies behind the tool site at this gap.
 
   The pads travel forward on an arc as the fingers close; the site is where their
   tips end when closed. Closed form of the maker's linkage.
   """
   angle = finger_angle(gap) + FINGER_ANGLE
-  return 0.1449 - (0.078 + FINGER_LENGTH * float(np.sin(angle)))
+  return 0.1449 - (0.078 + FINGER_LENGTH * jnp.sin(angle))

@@ -119,7 +119,7 @@ class PlacePlate:
     c, s = quat[:, self._holder, 0], quat[:, self._holder, 3]
     standing = np.stack([c, -s, c, s], -1) / np.sqrt(2)
     qpos[:, self._plate + 3 : self._plate + 7] = standing
-    return qpos, pos, quat
+    return ResetDraw(qpos, pos, quat, np.zeros(count, int))
 
   def tool_targets(
     self, state: PhysicsState, kinematics: Kinematics
@@ -195,11 +195,8 @@ class PlacePlate:
     return state.qpos[:, self._plate : self._plate + 3]
 
   def _axis(self, state: PhysicsState) -> Array:
-    """The plate's axis, the third column of its rotation."""
-    w, x, y, z = jnp.moveaxis(state.qpos[:, self._plate + 3 : self._plate + 7], -1, 0)
-    return jnp.stack(
-      [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x**2 + y**2)], -1
-    )
+    """Of the disc, without a sign."""
+    return geometry.axis(state.qpos[:, self._plate + 3 : self._plate + 7], 2)
 
   def _plate_yaw(self, state: PhysicsState) -> Array:
     """Heading of the plate's axis, which has no sign; 0 if it lies flat."""

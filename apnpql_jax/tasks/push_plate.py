@@ -104,7 +104,7 @@ class PushPlate:
     mocap_pos[:, self._goal, :2] = goal
     mocap_quat = np.zeros((count, self.scene.model.nmocap, 4))
     mocap_quat[..., 0] = 1
-    return qpos, mocap_pos, mocap_quat
+    return ResetDraw(qpos, mocap_pos, mocap_quat, np.zeros(count, int))
 
   def tool_targets(
     self, state: PhysicsState, kinematics: Kinematics

@@ -99,8 +99,8 @@ class StackBox:
       half = rng.uniform(-MAX_YAW, MAX_YAW, count) / 2
       qpos[:, address : address + 2] = spot
       qpos[:, address + 3], qpos[:, address + 6] = np.cos(half), np.sin(half)
-    nothing = np.zeros((count, 0, 3)), np.zeros((count, 0, 4))
-    return qpos, *nothing
+    no_mocap = np.zeros((count, 0, 3)), np.zeros((count, 0, 4))
+    return ResetDraw(qpos, *no_mocap, np.zeros(count, int))
 
   def tool_targets(
     self, state: PhysicsState, kinematics: Kinematics

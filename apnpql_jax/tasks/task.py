@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import importlib
 import pkgutil
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -19,8 +19,14 @@ from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
 
-ResetDraw = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""qpos f64[n, nq], mocap_pos f64[n, nmocap, 3], mocap_quat f64[n, nmocap, 4]."""
+
+class ResetDraw(NamedTuple):
+  """Initial states as a task draws them, before they are settled."""
+
+  qpos: np.ndarray  # f32[n, nq]
+  mocap_pos: np.ndarray  # f32[n, nmocap, 3]
+  mocap_quat: np.ndarray  # f32[n, nmocap, 4]
+  variant: np.ndarray  # i32[n]: of the scene
 
 
 class Task(Protocol):
