@@ -66,7 +66,9 @@ def along(w: Array, rays: Rays) -> Array:
   return w[0] * rays.u + w[1] * rays.v - w[2]
 
 
-def prepare(center: Array, axes: Array, size: np.ndarray, to_light: Array) -> Frames:
+def prepare(
+  center: Array, axes: Array, size: Array | np.ndarray, to_light: Array
+) -> Frames:
   """Per-geom part of the intersections.
 
   Args:
@@ -89,7 +91,7 @@ def prepare(center: Array, axes: Array, size: np.ndarray, to_light: Array) -> Fr
     center_light=(center * to_light[None]).sum(axis=1),
     center_norm2=(center * center).sum(axis=1),
     size=jnp.asarray(size),
-    inv_radius=jnp.asarray(1.0 / np.maximum(size[:, 0], _TINY)),
+    inv_radius=1.0 / jnp.maximum(size[:, 0], _TINY),
   )
 
 
