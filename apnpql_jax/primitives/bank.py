@@ -184,7 +184,7 @@ def _source(task: Task) -> str:
   own = pathlib.Path(inspect.getfile(type(task)))
   digest = hashlib.sha256(own.read_bytes())
   for path in sorted(own.parent.glob("*.py")):
-    if "\n@register(" not in (text := path.read_text(encoding="utf-8")):
+    if "\n@register\n" not in (text := path.read_text(encoding="utf-8")):
       digest.update(text.encode())
   return digest.hexdigest()
 

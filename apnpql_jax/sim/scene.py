@@ -188,11 +188,12 @@ def _differences(models: Sequence[mujoco.MjModel]) -> dict[str, np.ndarray]:
   """
   differences = {}
   for field in dataclasses.fields(mjx.Model):
-    values = [getattr(model, field.name, None) for model in models]
-    if not isinstance(values[0], np.ndarray) or values[0].dtype.kind != "f":
+    value = getattr(models[0], field.name, None)
+    if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
       continue
-    if any(not np.array_equal(values[0], value) for value in values):
-      differences[field.name] = np.stack(values).astype(np.float32)
+    values = np.stack([getattr(model, field.name) for model in models])
+    if (values != values[0]).any():
+      differences[field.name] = values.astype(np.float32)
   return differences
 
 

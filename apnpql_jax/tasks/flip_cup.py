@@ -25,12 +25,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from apnpql_jax.presets import mjcf_path
 from apnpql_jax.sim import arm
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
-from apnpql_jax.sim.scene import load_scene
 from apnpql_jax.tasks import geometry, pinch
+from apnpql_jax.tasks.table import TableTask
 from apnpql_jax.tasks.task import ResetDraw, register
 from apnpql_jax.types import Array
 
@@ -47,9 +46,6 @@ MAX_YAW = 0.3
 
 MIN_DISTANCE = 0.16
 """m between cup and goal: the mark and the widest cup apart."""
-
-ARM_NOISE = 0.1
-"""rad; uniform spread of the initial joint angles around the neutral ones."""
 
 MASS = 0.025
 """kg, a plastic cup's (YCB: 13 to 38 g). Held by a horizontal tool it pulls with
@@ -105,25 +101,18 @@ def _edit(shape: tuple[int, float, float]) -> Callable[[mujoco.MjSpec], None]:
   return functools.partial(shape_cup, sides=shape[0], half=shape[1], height=shape[2])
 
 
-@register("flip_cup")
-class FlipCup:
+@register
+class FlipCup(TableTask):
   """See the module's docstring; implements ``tasks.task.Task``."""
 
   name = "flip_cup"
+  arm_noise = 0.1
 
   def __init__(self):
-    self.scene = load_scene(
-      mjcf_path("flip_cup"),
-      cameras=("global", "wrist"),
-      variants=[_edit(shape) for shape in SHAPES],
-    )
+    super().__init__([_edit(shape) for shape in SHAPES])
     self._cup, self._cup_dof = self.scene.free_joint("cup")
     self._wall = self.scene.id("geom", "cup_0")
     self._goal = self.scene.mocap("goal")
-    self._neutral_qpos = self.scene.keyframe("neutral")
-    chain = arm.make_chain(self.scene)
-    neutral = jnp.asarray(self._neutral_qpos[self.scene.arm_qpos], jnp.float32)
-    self._neutral_pos, self._neutral_mat, _ = arm.forward(chain, neutral)
 
   def sample_resets(self, rng: np.random.Generator, count: int) -> ResetDraw:
     """See ``Task.sample_resets``; ranges are polar, around the robot's base."""
@@ -132,8 +121,7 @@ class FlipCup:
     while (near := np.linalg.norm(cup - goal, axis=-1) < MIN_DISTANCE).any():
       goal[near] = _from_polar(rng.uniform(low, high, (int(near.sum()), 2)))
     variant = rng.integers(len(SHAPES), size=count)
-    qpos = np.tile(self._neutral_qpos, (count, 1))
-    qpos[:, self.scene.arm_qpos] += rng.uniform(-ARM_NOISE, ARM_NOISE, (count, 6))
+    qpos = self.draw_qpos(rng, count)
     qpos[:, self._cup : self._cup + 2] = cup
     qpos[:, self._cup + 2] = np.array(SHAPES)[variant, 2] / 2
     heading = np.arctan2(cup[:, 1], cup[:, 0]) + rng.uniform(-MAX_YAW, MAX_YAW, count)
@@ -188,13 +176,12 @@ class FlipCup:
 
     turn = jnp.where(held, roll + free * (np.pi / 2 - roll), self._empty_roll(flip))
     heading = jnp.where((held & (free < 1))[:, None], reach, outward)
-    neutral = jnp.broadcast_to(self._neutral_pos, to_goal.shape)
     rotations = [
       _hand(reach, roll),
       _hand(heading, turn),
       jnp.broadcast_to(self._neutral_mat, (*roll.shape, 3, 3)),
     ]
-    return jnp.stack([to_object, to_goal, neutral], 1), jnp.stack(rotations, 1)
+    return self.with_neutral(to_object, to_goal), jnp.stack(rotations, 1)
 
   def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:
     """The cup stands upright on the goal, at rest, and the gripper has let go."""

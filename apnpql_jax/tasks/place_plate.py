@@ -19,13 +19,11 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax.presets import mjcf_path
-from apnpql_jax.sim import arm
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
-from apnpql_jax.sim.scene import load_scene
 from apnpql_jax.tasks import geometry
 from apnpql_jax.tasks.pinch import Pinch, pick_and_place
+from apnpql_jax.tasks.table import TableTask
 from apnpql_jax.tasks.task import ResetDraw, register
 from apnpql_jax.types import Array
 
@@ -37,9 +35,6 @@ HOLDER_YAW, BOX_YAW = 0.5, 0.3
 
 MIN_DISTANCE = 0.26
 """m between holder and box: half the box's diagonal (154 mm), the plate, fingers."""
-
-ARM_NOISE = 0.15
-"""rad; uniform spread of the initial joint angles around the neutral ones."""
 
 THICKNESS = 0.012
 """m; of the plate."""
@@ -81,20 +76,16 @@ CLEAR = 0.05
 """m; the gripper has let go when its pinch point is this far from the plate's edge."""
 
 
-@register("place_plate")
-class PlacePlate:
+@register
+class PlacePlate(TableTask):
   """See the module's docstring; implements ``tasks.task.Task``."""
 
   name = "place_plate"
 
   def __init__(self):
-    self.scene = load_scene(mjcf_path("place_plate"), cameras=("global", "wrist"))
+    super().__init__()
     self._plate, self._plate_dof = self.scene.free_joint("plate")
     self._goal, self._holder = self.scene.mocap("goal"), self.scene.mocap("holder")
-    self._neutral_qpos = self.scene.keyframe("neutral")
-    chain = arm.make_chain(self.scene)
-    neutral = jnp.asarray(self._neutral_qpos[self.scene.arm_qpos], jnp.float32)
-    self._neutral_pos, self._neutral_mat, _ = arm.forward(chain, neutral)
     self._hand = Pinch(self.scene, self._neutral_mat, width=THICKNESS, above=0.0)
 
   def sample_resets(self, rng: np.random.Generator, count: int) -> ResetDraw:
@@ -104,8 +95,7 @@ class PlacePlate:
     while (near := np.linalg.norm(holder - goal, axis=-1) < MIN_DISTANCE).any():
       again = int(near.sum())
       holder[near], goal[near] = rng.uniform(low, high, (2, again, 2))
-    qpos = np.tile(self._neutral_qpos, (count, 1))
-    qpos[:, self.scene.arm_qpos] += rng.uniform(-ARM_NOISE, ARM_NOISE, (count, 6))
+    qpos = self.draw_qpos(rng, count)
     pos, quat = np.zeros((count, 2, 3)), np.zeros((count, 2, 4))
     for index, spot, spread in (
       (self._holder, holder, HOLDER_YAW),
@@ -152,9 +142,7 @@ class PlacePlate:
     empty = jnp.where(leave, rise, geometry.up(goal[:, :2], TRAVEL))
     to_goal = jnp.where(held[:, None], carry, empty)
 
-    positions = jnp.stack(
-      [to_object, to_goal, jnp.broadcast_to(self._neutral_pos, to_goal.shape)], 1
-    )
+    positions = self.with_neutral(to_object, to_goal)
     box_yaw = geometry.yaw(state.mocap_quat[:, self._goal])
     # A plate that is still in its holder must not be turned.
     turn = jnp.where(held & (free < 1), self._plate_yaw(state), box_yaw)

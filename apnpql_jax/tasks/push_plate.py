@@ -19,11 +19,9 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax.presets import mjcf_path
-from apnpql_jax.sim import arm
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
-from apnpql_jax.sim.scene import load_scene
+from apnpql_jax.tasks.table import TableTask
 from apnpql_jax.tasks.task import ResetDraw, register
 from apnpql_jax.types import Array
 
@@ -32,9 +30,6 @@ WORKSPACE = ((0.36, 0.58), (-0.24, 0.24))
 
 MIN_DISTANCE = 0.12
 """m between plate and goal: four times the goal's tolerance."""
-
-ARM_NOISE = 0.15
-"""rad; uniform spread of the initial joint angles around the neutral ones."""
 
 GOAL_TOLERANCE = 0.03
 """m; the mark's radius exceeds the plate's by this much: solved = inside the mark."""
@@ -73,20 +68,16 @@ LOOKAHEAD = 0.07
 """m; longest step of a dragging tool's waypoint."""
 
 
-@register("push_plate")
-class PushPlate:
+@register
+class PushPlate(TableTask):
   """See the module's docstring; implements ``tasks.task.Task``."""
 
   name = "push_plate"
 
   def __init__(self):
-    self.scene = load_scene(mjcf_path("push_plate"), cameras=("global", "wrist"))
+    super().__init__()
     self._plate, self._plate_dof = self.scene.free_joint("plate")
     self._goal = self.scene.mocap("goal")
-    self._neutral_qpos = self.scene.keyframe("neutral")
-    chain = arm.make_chain(self.scene)
-    neutral = jnp.asarray(self._neutral_qpos[self.scene.arm_qpos], jnp.float32)
-    self._neutral_pos, self._neutral_mat, _ = arm.forward(chain, neutral)
 
   def sample_resets(self, rng: np.random.Generator, count: int) -> ResetDraw:
     """See ``Task.sample_resets``."""
@@ -94,8 +85,7 @@ class PushPlate:
     plate, goal = rng.uniform(low, high, (2, count, 2))
     while (near := np.linalg.norm(plate - goal, axis=-1) < MIN_DISTANCE).any():
       goal[near] = rng.uniform(low, high, (int(near.sum()), 2))
-    qpos = np.tile(self._neutral_qpos, (count, 1))
-    qpos[:, self.scene.arm_qpos] += rng.uniform(-ARM_NOISE, ARM_NOISE, (count, 6))
+    qpos = self.draw_qpos(rng, count)
     qpos[:, self._plate : self._plate + 2] = plate
     yaw = rng.uniform(-np.pi, np.pi, count)
     qpos[:, self._plate + 3] = np.cos(yaw / 2)
@@ -132,8 +122,7 @@ class PushPlate:
     drag = drag * reach[:, None]
     over_goal = jnp.where(above, waypoint(goal, HOVER_HEIGHT), rise)
     to_goal = jnp.where(inside, waypoint(tool[:, :2] + drag, DRAG_HEIGHT), over_goal)
-    neutral = jnp.broadcast_to(self._neutral_pos, to_goal.shape)
-    positions = jnp.stack([to_object, to_goal, neutral], axis=1)
+    positions = self.with_neutral(to_object, to_goal)
     return positions, jnp.broadcast_to(self._neutral_mat, (*positions.shape, 3))
 
   def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:

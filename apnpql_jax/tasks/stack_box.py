@@ -17,13 +17,11 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax.presets import mjcf_path
-from apnpql_jax.sim import arm
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
-from apnpql_jax.sim.scene import load_scene
 from apnpql_jax.tasks import geometry
 from apnpql_jax.tasks.pinch import Pinch, pick_and_place
+from apnpql_jax.tasks.table import TableTask
 from apnpql_jax.tasks.task import ResetDraw, register
 from apnpql_jax.types import Array
 
@@ -35,9 +33,6 @@ MAX_YAW = 0.35
 
 MIN_DISTANCE = 0.13
 """m between the boxes: the open fingers (107 mm) around one clear the other."""
-
-ARM_NOISE = 0.15
-"""rad; uniform spread of the initial joint angles around the neutral ones."""
 
 SIDE = 0.05
 """m; edge of a box."""
@@ -70,20 +65,16 @@ CLEAR = 0.05
 """m; the gripper has let go when the tool is this far from the box."""
 
 
-@register("stack_box")
-class StackBox:
+@register
+class StackBox(TableTask):
   """See the module's docstring; implements ``tasks.task.Task``."""
 
   name = "stack_box"
 
   def __init__(self):
-    self.scene = load_scene(mjcf_path("stack_box"), cameras=("global", "wrist"))
+    super().__init__()
     self._yellow, self._yellow_dof = self.scene.free_joint("yellow")
     self._blue, self._blue_dof = self.scene.free_joint("blue")
-    self._neutral_qpos = self.scene.keyframe("neutral")
-    chain = arm.make_chain(self.scene)
-    neutral = jnp.asarray(self._neutral_qpos[self.scene.arm_qpos], jnp.float32)
-    self._neutral_pos, self._neutral_mat, _ = arm.forward(chain, neutral)
     # Four millimetres above the centre, for room between fingers and table.
     self._hand = Pinch(self.scene, self._neutral_mat, width=SIDE, above=0.004)
 
@@ -93,8 +84,7 @@ class StackBox:
     yellow, blue = rng.uniform(low, high, (2, count, 2))
     while (near := np.linalg.norm(yellow - blue, axis=-1) < MIN_DISTANCE).any():
       blue[near] = rng.uniform(low, high, (int(near.sum()), 2))
-    qpos = np.tile(self._neutral_qpos, (count, 1))
-    qpos[:, self.scene.arm_qpos] += rng.uniform(-ARM_NOISE, ARM_NOISE, (count, 6))
+    qpos = self.draw_qpos(rng, count)
     for address, spot in ((self._yellow, yellow), (self._blue, blue)):
       half = rng.uniform(-MAX_YAW, MAX_YAW, count) / 2
       qpos[:, address : address + 2] = spot
@@ -133,9 +123,7 @@ class StackBox:
     empty = jnp.where((off_blue > FUNNEL)[:, None] & low, rise, above)
     to_goal = jnp.where(held[:, None], onto, empty)
 
-    positions = jnp.stack(
-      [to_object, to_goal, jnp.broadcast_to(self._neutral_pos, to_goal.shape)], 1
-    )
+    positions = self.with_neutral(to_object, to_goal)
     turns = jnp.stack([yellow_yaw, blue_yaw, 0 * blue_yaw], 1)
     return positions, geometry.turn_z(turns) @ self._neutral_mat
 

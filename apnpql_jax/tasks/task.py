@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import importlib
 import pkgutil
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -66,16 +66,13 @@ class Task(Protocol):
 
 
 _REGISTRY: dict[str, Callable[[], Task]] = {}
+T = TypeVar("T", bound=Task)
 
 
-def register(name: str) -> Callable:
-  """Class decorator that makes a task known under ``name``."""
-
-  def decorate(factory: Callable[[], Task]) -> Callable[[], Task]:
-    _REGISTRY[name] = factory
-    return factory
-
-  return decorate
+def register(task: type[T]) -> type[T]:
+  """Class decorator that makes a task known under its ``name``."""
+  _REGISTRY[task.name] = task
+  return task
 
 
 def task_names() -> list[str]:

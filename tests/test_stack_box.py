@@ -1,0 +1,470 @@
+"""stack_box: resets, success on hand-made states, tool targets, privileged poses."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from apnpql_jax.sim import physics
+from apnpql_jax.sim.kinematics import make_kinematics
+from apnpql_jax.tasks import make_task, stack_box, task_names
+from apnpql_jax.tasks.pinch import finger_angle, pinch_height
+
+WORLDS = 16
+OPEN = 0.1
+"""m between the pads."""
+
+GRASP = 0.004 - float(pinch_height(stack_box.SIDE))
+"""m; height of the tool over the box's centre when the pads are 4 mm above it."""
+
+ON_BLUE = (0.0, 0.0, stack_box.SIDE)
+
+
+@pytest.fixture(scope="module")
+def task():
+  return make_task("stack_box")
+
+
+@pytest.fixture(scope="module")
+def resets(task):
+  draw = task.sample_resets(np.random.default_rng(3), WORLDS)
+  return physics.initial_state(task.scene, *map(jnp.asarray, draw))
+
+
+@pytest.fixture(scope="module")
+def kinematics(task, resets):
+  """The arm is high over the table; no test moves more of it than the tool."""
+  return jax.jit(make_kinematics(task.scene))(resets)
+
+
+@pytest.fixture(scope="module")
+def solved(task, resets):
+  """All worlds with the yellow box at rest exactly on the blue one."""
+  return put(task, resets, "yellow", pos(task, resets, "blue") + jnp.array(ON_BLUE))
+
+
+@pytest.fixture(scope="module")
+def neutral(task):
+  """Position and rotation of the tool at the keyframe, from C MuJoCo."""
+  data = mujoco.MjData(task.scene.model)
+  mujoco.mj_resetDataKeyframe(task.scene.model, data, 0)
+  mujoco.mj_kinematics(task.scene.model, data)
+  tool = data.site("tool")
+  return tool.xpos.copy(), tool.xmat.reshape(3, 3).copy()
+
+
+def pos(task, state, body):
+  address, _ = task.scene.free_joint(body)
+  return state.qpos[:, address : address + 3]
+
+
+def rotation(task, qpos, body) -> Rotation:
+  address, _ = task.scene.free_joint(body)
+  quat = np.asarray(qpos[:, address + 3 : address + 7], np.float64)
+  return Rotation.from_quat(quat, scalar_first=True)
+
+
+def put(task, state, body, where=None, turn: Rotation | None = None):
+  """Moves a body to ``where`` and turns it, from the pose it has in ``state``."""
+  address, _ = task.scene.free_joint(body)
+  qpos = state.qpos
+  if where is not None:
+    qpos = qpos.at[:, address : address + 3].set(where)
+  if turn is not None:
+    quat = (rotation(task, qpos, body) * turn).as_quat(scalar_first=True)
+    qpos = qpos.at[:, address + 3 : address + 7].set(quat)
+  return state.replace(qpos=qpos)
+
+
+def moved(task, state, body, shift):
+  return put(task, state, body, pos(task, state, body) + jnp.array(shift))
+
+
+def with_gap(task, state, gap):
+  """The pads are ``gap`` apart."""
+  fingers = [task.scene.model.joint(f"finger_{x}") for x in ("r1", "r2", "l1", "l2")]
+  address = np.array([finger.qposadr[0] for finger in fingers])
+  return state.replace(qpos=state.qpos.at[:, address].set(finger_angle(gap)))
+
+
+def tool_at(task, kinematics, where, mat=None):
+  tool = task.scene.tool_site
+  kinematics = kinematics.replace(site_xpos=kinematics.site_xpos.at[:, tool].set(where))
+  if mat is None:
+    return kinematics
+  return kinematics.replace(site_xmat=kinematics.site_xmat.at[:, tool].set(mat))
+
+
+def hand_at(task, state, kinematics, neutral, shift, twist=0.0):
+  """A vertical tool at ``shift`` from its grasp of yellow, turned by ``twist``."""
+  where = pos(task, state, "yellow") + jnp.array([0.0, 0.0, GRASP]) + jnp.array(shift)
+  heading = rotation(task, state.qpos, "yellow").as_euler("ZYX")[:, :1]
+  turn = Rotation.from_euler("z", heading + twist).as_matrix()
+  return tool_at(task, kinematics, where, turn @ neutral[1])
+
+
+def test_it_is_registered():
+  assert "stack_box" in task_names()
+
+
+@pytest.fixture(scope="module")
+def draws(task):
+  return task.sample_resets(np.random.default_rng(0), 4000).qpos
+
+
+def share(values, low, high):
+  return (values - low) / (np.asarray(high) - low)
+
+
+def assert_uniform(shares) -> None:
+  assert shares.min() >= 0 and shares.max() <= 1
+  for column in shares.reshape(len(shares), -1).T:
+    assert stats.kstest(column, "uniform").pvalue > 1e-3
+
+
+def test_resets_are_unsolved(task, resets, kinematics):
+  assert not task.success(resets, kinematics).any()
+
+
+def test_resets_are_uniform_in_range(task, draws):
+  scene = task.scene
+  low, high = np.array(stack_box.WORKSPACE).T
+  yellow, _ = scene.free_joint("yellow")
+  assert_uniform(share(draws[:, yellow : yellow + 2], low, high))
+  arm = draws[:, scene.arm_qpos] - scene.keyframe("neutral")[scene.arm_qpos]
+  assert_uniform(share(arm, -task.arm_noise, task.arm_noise))
+  for body in ("yellow", "blue"):
+    turn = rotation(task, draws, body).as_rotvec()
+    np.testing.assert_allclose(turn[:, :2], 0, atol=1e-12)
+    assert_uniform(share(turn[:, 2], -stack_box.MAX_YAW, stack_box.MAX_YAW))
+
+
+def test_what_is_drawn_is_independent(task, draws):
+  turns = [rotation(task, draws, body).as_rotvec() for body in ("yellow", "blue")]
+  turns = np.stack([turn[:, 2] for turn in turns])
+  correlation = np.corrcoef(np.vstack([draws[:, task.scene.arm_qpos].T, turns]))
+  np.testing.assert_allclose(correlation, np.eye(8), atol=0.07)  # Over four sigma.
+
+
+def test_the_blue_box_is_uniform_where_it_may_be(task, draws):
+  """By drawing it again for the same yellow boxes."""
+  yellow, blue = (
+    draws[:, address : address + 2]
+    for address, _ in map(task.scene.free_joint, ("yellow", "blue"))
+  )
+  low, high = np.array(stack_box.WORKSPACE).T
+  assert (blue >= low).all() and (blue <= high).all()
+  distance = np.linalg.norm(yellow - blue, axis=-1)
+  assert stack_box.MIN_DISTANCE <= distance.min() < stack_box.MIN_DISTANCE + 0.01
+  tries = np.random.default_rng(1).uniform(low, high, (100, *yellow.shape))
+  free = np.linalg.norm(tries - yellow, axis=-1) >= stack_box.MIN_DISTANCE
+  expected = tries[free.argmax(0), np.arange(len(yellow))]
+  assert stats.ks_2samp(blue[:, 0], expected[:, 0]).pvalue > 1e-3
+  assert stats.ks_2samp(blue[:, 1], expected[:, 1]).pvalue > 1e-3
+  expected = np.linalg.norm(yellow - expected, axis=-1)
+  assert stats.ks_2samp(distance, expected).pvalue > 1e-3
+
+
+def test_the_rest_of_a_reset_is_the_keyframe(task, draws):
+  drawn = list(task.scene.arm_qpos)
+  for body in ("yellow", "blue"):
+    address, _ = task.scene.free_joint(body)
+    drawn += [address, address + 1, *range(address + 3, address + 7)]
+  neutral = np.delete(task.scene.keyframe("neutral"), drawn)
+  rest = np.delete(draws, drawn, axis=1)
+  np.testing.assert_array_equal(rest, np.broadcast_to(neutral, rest.shape))
+
+
+def test_nothing_touches_but_the_boxes_the_table(task, draws):
+  model = task.scene.model
+  data = mujoco.MjData(model)
+
+  def distance(one, other):
+    ids = (model.geom(name).id for name in (one, other))
+    return mujoco.mj_geomDistance(model, data, *ids, 1.0, None)
+
+  for qpos in draws[:200]:
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    assert (np.abs(data.contact.dist) < 1e-6).all()
+    assert distance("yellow", "blue") > 0.05
+    for box in ("yellow", "blue"):
+      assert abs(distance("table", box)) < 1e-6
+    for part in ("r_tip", "l_tip", "hand", "d435"):
+      assert min(distance(part, x) for x in ("table", "yellow", "blue")) > 0.02
+
+
+def judge(task, state, kinematics) -> np.ndarray:
+  return np.asarray(task.success(state, kinematics))
+
+
+def test_yellow_at_rest_on_blue_is_success(task, solved, kinematics):
+  assert judge(task, solved, kinematics).all()
+
+
+@pytest.mark.parametrize(
+  ("shift", "expected"),
+  [
+    ((0.019, 0.0, 0.0), True),
+    ((0.021, 0.0, 0.0), False),
+    ((0.0, -0.019, 0.0), True),
+    ((0.0, -0.021, 0.0), False),
+    ((-0.013, 0.013, 0.0), True),
+    ((-0.015, 0.015, 0.0), False),  # Round, not square.
+    ((0.0, 0.0, 0.004), True),
+    ((0.0, 0.0, 0.006), False),
+    ((0.0, 0.0, -0.004), True),
+    ((0.0, 0.0, -0.006), False),
+    ((0.0, 0.0, 0.1), False),  # Held in the air.
+    ((0.05, 0.0, -0.05), False),  # Beside the blue box.
+    ((0.0, 0.0, -0.1), False),  # Below it.
+  ],
+)
+def test_yellow_must_be_on_blue(task, solved, kinematics, shift, expected):
+  state = moved(task, solved, "yellow", shift)
+  assert (judge(task, state, kinematics) == expected).all()
+
+
+@pytest.mark.parametrize(
+  ("height", "expected"), [(0.004, True), (0.006, False), (0.2, False)]
+)
+def test_blue_must_be_on_the_table(task, solved, kinematics, height, expected):
+  for body in ("yellow", "blue"):
+    solved = moved(task, solved, body, (0.0, 0.0, height))
+  assert (judge(task, solved, kinematics) == expected).all()
+
+
+def test_blue_on_yellow_is_no_success(task, resets, kinematics):
+  state = put(task, resets, "blue", pos(task, resets, "yellow") + jnp.array(ON_BLUE))
+  assert not judge(task, state, kinematics).any()
+
+
+def test_the_stack_may_have_moved_but_only_as_a_whole(task, solved, kinematics):
+  pushed = moved(task, solved, "blue", (0.06, -0.03, 0.0))
+  assert not judge(task, pushed, kinematics).any()
+  together = moved(task, pushed, "yellow", (0.06, -0.03, 0.0))
+  assert judge(task, together, kinematics).all()
+
+
+@pytest.mark.parametrize("body", ["yellow", "blue"])
+@pytest.mark.parametrize(
+  ("axis", "angle"), [("x", np.pi), ("y", np.pi / 2), ("x", -np.pi / 2), ("z", 0.8)]
+)
+def test_a_box_may_lie_on_any_face(task, solved, kinematics, body, axis, angle):
+  """Its faces look the same."""
+  state = put(task, solved, body, turn=Rotation.from_euler(axis, angle))
+  assert judge(task, state, kinematics).all()
+
+
+@pytest.mark.parametrize("angle", [0.35, np.pi / 4])
+def test_a_yellow_box_that_is_tipped_is_no_success(task, solved, kinematics, angle):
+  """With an edge on the blue box: its centre is higher than that of a lying one."""
+  height = stack_box.SIDE / 2 * (np.cos(angle) + np.sin(angle) - 1)
+  state = put(task, solved, "yellow", turn=Rotation.from_euler("y", angle))
+  state = moved(task, state, "yellow", (0.0, 0.0, height))
+  assert not judge(task, state, kinematics).any()
+
+
+@pytest.mark.parametrize("body", ["yellow", "blue"])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_both_boxes_must_be_at_rest(task, solved, kinematics, body, axis):
+  _, dof = task.scene.free_joint(body)
+  for speed, expected in ((0.04, True), (0.06, False), (-0.06, False)):
+    state = solved.replace(qvel=solved.qvel.at[:, dof + axis].set(speed))
+    assert (judge(task, state, kinematics) == expected).all()
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize(
+  ("distance", "expected"), [(0.0, False), (0.049, False), (0.051, True)]
+)
+def test_the_hand_must_be_away(task, solved, kinematics, axis, distance, expected):
+  tool = pos(task, solved, "yellow").at[:, axis].add(distance)
+  state = judge(task, solved, tool_at(task, kinematics, tool))
+  assert (state == expected).all()
+
+
+def test_a_box_that_is_still_held_is_no_success(task, solved, kinematics, neutral):
+  held = with_gap(task, solved, stack_box.SIDE)
+  hand = hand_at(task, held, kinematics, neutral, (0.0, 0.0, 0.0))
+  assert not judge(task, held, hand).any()
+
+
+def test_a_stack_at_the_tolerance_stands(task, solved, kinematics):
+  """What counts as solved stays so: 0.6 s of C MuJoCo."""
+  state = moved(task, solved, "yellow", (0.0, 0.019, 0.0))
+  engine = jax.jit(physics.make_physics("native", task.scene, substeps=30).step)
+  for _ in range(4):
+    state = engine(state, jnp.zeros((WORLDS, 6)), jnp.zeros(WORLDS))
+  assert judge(task, state, kinematics).all()
+
+
+FUNNEL_WIDTH = stack_box.FUNNEL - stack_box.ALIGNED
+
+
+@pytest.mark.parametrize(
+  ("shift", "gap", "twist", "funnel"),
+  [
+    # High and away: above the box. In the funnel: lower. Aligned: down.
+    ((0.10, 0.0, 0.15), OPEN, 0.0, 1.0),
+    ((0.0, -0.031, 0.15), OPEN, 0.0, 0.5),
+    ((0.031, 0.0, 0.02), OPEN, 0.0, 0.5),
+    ((-0.01, 0.0, 0.07), OPEN, 0.0, 0.0),
+    ((0.0, 0.0, 0.0), OPEN, 0.0, 0.0),
+    # Only as far down as the fingers are turned to the faces.
+    ((0.0, 0.0, 0.07), OPEN, 0.3, (0.05 * 0.3 - 0.012) / FUNNEL_WIDTH),
+    ((0.0, 0.02, 0.07), OPEN, -0.3, (0.02 + 0.05 * 0.3 - 0.012) / FUNNEL_WIDTH),
+    ((0.0, 0.0, 0.07), OPEN, 1.5 * np.pi, 0.0),
+    # Fingers closed on nothing do not descend.
+    ((0.0, 0.0, 0.07), 0.02, 0.0, 1.0),
+    ((0.0, 0.0, 0.07), 0.07, 0.0, 1.0),
+    # Fingers that close around the box stay, unless they are turned away from it.
+    ((0.0, 0.0, 0.005), 0.07, 0.05, 0.0),
+    ((0.0, 0.0, 0.0), 0.07, 0.2, 1.0),
+    # So do those that have it, also if they have slipped by 2 cm.
+    ((0.0, 0.0, 0.0), stack_box.SIDE, 0.0, 0.0),
+    ((0.02, 0.0, 0.0), stack_box.SIDE, 0.0, 0.008 / FUNNEL_WIDTH),
+    ((0.03, 0.0, 0.0), stack_box.SIDE, 0.0, 1.0),
+  ],
+)
+def test_object_target(task, resets, kinematics, neutral, shift, gap, twist, funnel):
+  state = with_gap(task, resets, gap)
+  hand = hand_at(task, state, kinematics, neutral, shift, twist)
+  positions, _ = task.tool_targets(state, hand)
+  height = GRASP + stack_box.HOVER * funnel
+  expected = pos(task, state, "yellow") + jnp.array([0.0, 0.0, height])
+  np.testing.assert_allclose(positions[:, 0], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("row", "body"), [(0, "yellow"), (1, "blue")])
+@pytest.mark.parametrize("gap", [OPEN, 0.02, stack_box.SIDE])
+@pytest.mark.parametrize(
+  ("off", "height", "rises"),
+  [
+    (0.08, 0.03, True),
+    (0.051, 0.03, True),
+    (0.08, 0.109, True),
+    (0.08, 0.111, False),
+    (0.049, 0.03, False),
+  ],
+)
+def test_a_low_tool_that_is_away_rises(
+  task, resets, kinematics, row, body, gap, off, height, rises
+):
+  """By x, the boxes being further apart than that."""
+  tool = pos(task, resets, body).at[:, 0].add(off).at[:, 2].set(height)
+  state = with_gap(task, resets, gap)
+  positions, _ = task.tool_targets(state, tool_at(task, kinematics, tool))
+  over = tool if rises else pos(task, resets, body)
+  np.testing.assert_allclose(positions[:, row, :2], over[:, :2], atol=1e-6)
+  if rises or body == "blue":
+    np.testing.assert_allclose(positions[:, row, 2], stack_box.TRAVEL, rtol=1e-6)
+
+
+def test_an_empty_hand_goes_above_the_goal(task, resets, kinematics):
+  high = tool_at(task, kinematics, jnp.array([0.5, 0.0, 0.3]))
+  positions, _ = task.tool_targets(resets, high)
+  blue = pos(task, resets, "blue")
+  expected = blue.at[:, 2].set(stack_box.TRAVEL)
+  np.testing.assert_allclose(positions[:, 1], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+  ("shift", "lift"),
+  [
+    ((0.15, 0.0, 0.0), 1.0),
+    ((0.0, -0.3, 0.1), 1.0),
+    ((0.028, 0.0, 0.1), 0.5),
+    ((0.0, 0.005, 0.08), 0.0),
+    ((0.0, 0.0, 0.05), 0.0),
+  ],
+)
+@pytest.mark.parametrize("slip", [0.0, 0.02])
+def test_a_held_box_is_carried_onto_the_blue_one(
+  task, resets, kinematics, neutral, shift, lift, slip
+):
+  """The box, not the tool, arrives at the goal: 1 mm above the blue one at last."""
+  blue = pos(task, resets, "blue")
+  state = put(task, resets, "yellow", blue + jnp.array(shift))
+  state = with_gap(task, state, stack_box.SIDE)
+  hand = hand_at(task, state, kinematics, neutral, (slip, 0.0, 0.0))
+  positions, _ = task.tool_targets(state, hand)
+  step = positions[:, 1] - hand.site_xpos[:, task.scene.tool_site]
+  height = stack_box.SIDE + 0.001 + stack_box.LIFT * lift
+  expected = blue + jnp.array([0.0, 0.0, height])
+  np.testing.assert_allclose(pos(task, state, "yellow") + step, expected, atol=1e-5)
+
+
+def test_the_neutral_target_is_the_keyframe(task, resets, kinematics, neutral):
+  positions, rotations = task.tool_targets(resets, kinematics)
+  expected = np.broadcast_to(neutral[0], (WORLDS, 3))
+  np.testing.assert_allclose(positions[:, 2], expected, atol=1e-5)
+  expected = np.broadcast_to(neutral[1], (WORLDS, 3, 3))
+  np.testing.assert_allclose(rotations[:, 2], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("row", "body"), [(0, "yellow"), (1, "blue")])
+@pytest.mark.parametrize("turn", [0.0, 1.0, 2.5, -2.0])
+def test_the_fingers_close_on_faces(task, resets, kinematics, neutral, row, body, turn):
+  """Of four ways, on that which is least turned from neutral; the tool points down."""
+  state = put(task, resets, body, turn=Rotation.from_euler("z", turn))
+  target = np.asarray(task.tool_targets(state, kinematics)[1])[:, row]
+  np.testing.assert_allclose(target[:, 2, 2], -1, atol=1e-3)
+  face = rotation(task, state.qpos, body).inv().apply(target[:, :, 1])
+  np.testing.assert_allclose(np.abs(face).max(-1), 1, atol=1e-4)
+  turned = Rotation.from_matrix(target) * Rotation.from_matrix(neutral[1]).inv()
+  assert (turned.magnitude() < np.pi / 4 + 1e-3).all()
+
+
+def faces(task, state, body) -> np.ndarray:
+  """Centre of the box and of its face nearest to the world's x axis, f64[n, 6]."""
+  mat = rotation(task, state.qpos, body).as_matrix()
+  normals = np.concatenate([mat, -mat], axis=-1)  # f64[n, 3, 6]
+  nearest = normals[:, 0].argmax(-1)
+  normal = normals[np.arange(len(mat)), :, nearest]
+  centre = np.asarray(pos(task, state, body), np.float64)
+  return np.concatenate([centre, centre + stack_box.SIDE / 2 * normal], -1)
+
+
+@pytest.mark.parametrize("upside_down", [False, True])
+@pytest.mark.parametrize("turn", [0.0, 0.7, 1.2, 2.9, -2.0])
+def test_objects_are_the_boxes_and_their_faces(task, resets, turn, upside_down):
+  state = resets
+  for body in ("yellow", "blue"):
+    state = put(task, state, body, turn=Rotation.from_euler("z", turn))
+    if upside_down:
+      state = put(task, state, body, turn=Rotation.from_euler("x", np.pi))
+  state = moved(task, state, "yellow", (0.01, 0.02, 0.03))
+  expected = [faces(task, state, body) for body in ("yellow", "blue")]
+  np.testing.assert_allclose(task.objects(state), np.hstack(expected), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+  ("place", "gap", "lift", "row", "close"),
+  [
+    ("table", OPEN, 0.1, 0, 0),  # Reach.
+    ("table", OPEN, 0.0, 0, 1),  # Close.
+    ("table", stack_box.SIDE, 0.0, 1, 1),  # Carry.
+    ("blue", stack_box.SIDE, 0.0, 0, 0),  # Let go.
+    ("blue", OPEN, 0.0, 2, 0),  # Withdraw.
+    ("blue's edge", stack_box.SIDE, 0.0, 1, 1),  # Not good enough to let go.
+  ],
+)
+def test_the_expert_picks_and_places(
+  task, resets, kinematics, neutral, place, gap, lift, row, close
+):
+  if place != "table":
+    edge = 0.015 if place == "blue's edge" else 0.0
+    on_blue = pos(task, resets, "blue") + jnp.array(ON_BLUE).at[0].add(edge)
+    resets = put(task, resets, "yellow", on_blue)
+  state = with_gap(task, resets, gap)
+  hand = hand_at(task, state, kinematics, neutral, (0.0, 0.0, lift))
+  primitives = jnp.arange(WORLDS * 18.0).reshape(WORLDS, 3, 6)
+  action = task.expert(state, hand, primitives)
+  np.testing.assert_array_equal(action[:, :6], primitives[:, row])
+  np.testing.assert_array_equal(action[:, 6], np.full(WORLDS, close))
