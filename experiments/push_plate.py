@@ -11,9 +11,9 @@ CONFIG = TrainConfig(
   env=EnvConfig(task="push_plate", obs="pixels", backend="auto", worlds=32),
   agent=AgentConfig(
     algorithm="ap_npql",
-    n_step=8,
+    n_step=5,
     epsilon=1.0,
-    min_alpha=0.03,
+    min_alpha=0.01,
     epsilon_nu=-14.0,
     min_std=0.01,
     initial_std=0.03,

@@ -251,7 +251,7 @@ def judge(task, state, kinematics) -> np.ndarray:
   return np.asarray(task.success(state, kinematics))
 
 
-LEAN = np.array([0.0, 0.0, RADIUS * np.sin(1.0)])
+LEAN = np.array([0.0, 0.0, RADIUS * np.sin(1.0) + FLOOR * np.cos(1.0)])
 
 
 @pytest.mark.parametrize(
@@ -303,7 +303,8 @@ def test_its_centre_must_be_between_the_walls(
     (STANDING, (0.0, 0.0, RADIUS + place_plate.LIFT), False),  # Held over the box.
     (lying(1.0), LEAN + [0.0, 0.0, 0.011], True),
     (lying(1.0), LEAN + [0.0, 0.0, 0.013], False),
-    (lying(), (0.0, 0.0, FLOOR + 0.02), False),  # Held, lying.
+    (lying(), (0.0, 0.0, FLOOR + 0.011), True),
+    (lying(), (0.0, 0.0, FLOOR + 0.013), False),  # Held, lying.
     (lying(), (0.11, 0.0, 0.04 + FLOOR), False),  # On top of a wall.
     (STANDING, (0.0, 0.08, 0.04 + RADIUS), False),
     (lying(np.pi / 4), (0.151, 0.0, RADIUS * np.sqrt(0.5)), False),  # Leans from out.
@@ -336,16 +337,16 @@ def test_a_moving_plate_is_no_success(task, solved, kinematics, axis):
 @pytest.mark.parametrize("turn", [STANDING, lying(1.2)])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize(
-  ("distance", "expected"), [(0.0, False), (0.049, False), (0.051, True)]
+  ("distance", "expected"), [(0.0, False), (RIM, False), (0.101, False), (0.103, True)]
 )
 def test_the_hand_must_be_away(
   task, resets, kinematics, neutral, turn, axis, distance, expected
 ):
-  """Measured from the pinch point to where it would grip."""
+  """Outside of the circle where it could grip, by 5 cm, in any direction."""
   tilt = turn.as_matrix()[2, 2]
   height = RADIUS * np.sqrt(1 - tilt**2)
   state = in_box(task, resets, (0.0, 0.0, height), turn)
-  tool = edge(task, state).at[:, 2].add(GRASP).at[:, axis].add(distance)
+  tool = pos(task, state).at[:, 2].add(GRASP).at[:, axis].add(distance)
   hand = tool_at(task, kinematics, tool, neutral[1])
   assert (judge(task, state, hand) == expected).all()
 

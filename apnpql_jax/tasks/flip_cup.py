@@ -72,9 +72,6 @@ GOAL_TOLERANCE = 0.03
 UPRIGHT = 0.97
 """Cosine of the largest tilt of a cup that stands: 14 degrees."""
 
-REST_SPEED = 0.05
-"""m/s; above float32 contact noise."""
-
 CLEAR = 0.05
 """m; the gripper has let go when its pinch point is this far from the cup's axis."""
 
@@ -119,7 +116,8 @@ class FlipCup(TableTask):
     low, high = np.array(RANGE).T
     cup, goal = _from_polar(rng.uniform(low, high, (2, count, 2)))
     while (near := np.linalg.norm(cup - goal, axis=-1) < MIN_DISTANCE).any():
-      goal[near] = _from_polar(rng.uniform(low, high, (int(near.sum()), 2)))
+      again = rng.uniform(low, high, (2, int(near.sum()), 2))
+      cup[near], goal[near] = _from_polar(again)
     variant = rng.integers(len(SHAPES), size=count)
     qpos = self.draw_qpos(rng, count)
     qpos[:, self._cup : self._cup + 2] = cup
@@ -185,9 +183,9 @@ class FlipCup(TableTask):
 
   def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:
     """The cup stands upright on the goal, at rest, and the gripper has let go."""
-    speed = geometry.norm(state.qvel[:, self._cup_dof : self._cup_dof + 6])
+    at_rest = geometry.is_at_rest(state.qvel[:, self._cup_dof : self._cup_dof + 6])
     away = geometry.norm(self._pinch_point(state, kinematics) - self._cup_pos(state))
-    return self._placed(state) & (speed < REST_SPEED) & (away > CLEAR)
+    return self._placed(state) & at_rest & (away > CLEAR)
 
   def objects(self, state: PhysicsState) -> Array:
     """f32[worlds, 11]: cup's centre, a point 5 cm towards its mouth, the goal, m, and

@@ -9,6 +9,13 @@ import jax.numpy as jnp
 
 from apnpql_jax.types import Array
 
+REST_SPEED = 0.05
+"""m/s; above float32 contact noise, and slow enough to stop within a millimetre:
+v^2 / 2 mu g is 0.7 mm at mu = 0.2."""
+
+REST_TURN = 0.5
+"""rad/s."""
+
 
 def norm(x: Array) -> Array:
   """f32[*b, n] -> f32[*b], with a gradient at zero."""
@@ -32,6 +39,14 @@ def axis(quat: Array, index: int) -> Array:
   return jnp.stack(columns[index], -1)
 
 
+def level_heading(quat: Array) -> Array:
+  """Heading of the most level axis of a box, which may lie on any of its faces."""
+  axes = jnp.stack([axis(quat, i) for i in range(3)])
+  level = jnp.argmin(jnp.abs(axes[..., 2]), axis=0)
+  x, y = (jnp.take_along_axis(axes[..., i], level[None], axis=0)[0] for i in range(2))
+  return jnp.arctan2(y, x)
+
+
 def fold(angle: Array, period: float) -> Array:
   """The equivalent angle nearest to zero of a shape that repeats every ``period``."""
   return angle - period * jnp.round(angle / period)
@@ -48,6 +63,11 @@ def up(xy: Array, height: Array | float) -> Array:
   """The point at ``height`` over ``xy``, f32[*b, 2] -> f32[*b, 3]."""
   height = jnp.broadcast_to(jnp.asarray(height), xy.shape[:-1])
   return jnp.concatenate([xy, height[..., None]], -1)
+
+
+def is_at_rest(twist: Array) -> Array:
+  """Linear and angular velocity f32[*b, 6] near zero -> bool[*b]."""
+  return (norm(twist[..., :3]) < REST_SPEED) & (norm(twist[..., 3:]) < REST_TURN)
 
 
 def funnel(off: Array, *, aligned: float, wide: float) -> Array:

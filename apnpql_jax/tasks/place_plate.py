@@ -69,11 +69,9 @@ INSIDE = (0.12, 0.085)
 ON_FLOOR = 0.012
 """m; success allows the plate's lowest point this far above the table."""
 
-REST_SPEED = 0.05
-"""m/s; above float32 contact noise."""
-
 CLEAR = 0.05
-"""m; the gripper has let go when its pinch point is this far from the plate's edge."""
+"""m; the gripper has let go when its pinch point is this far outside of the circle
+where it gripped the plate."""
 
 
 @register
@@ -93,8 +91,7 @@ class PlacePlate(TableTask):
     low, high = np.array(WORKSPACE).T
     holder, goal = rng.uniform(low, high, (2, count, 2))
     while (near := np.linalg.norm(holder - goal, axis=-1) < MIN_DISTANCE).any():
-      again = int(near.sum())
-      holder[near], goal[near] = rng.uniform(low, high, (2, again, 2))
+      holder[near], goal[near] = rng.uniform(low, high, (2, int(near.sum()), 2))
     qpos = self.draw_qpos(rng, count)
     pos, quat = np.zeros((count, 2, 3)), np.zeros((count, 2, 4))
     for index, spot, spread in (
@@ -125,7 +122,7 @@ class PlacePlate(TableTask):
     low = tool[:, 2] < TRAVEL - 0.02
 
     off = geometry.norm(tool[:, :2] - edge[:, :2])
-    leave = ((off > FUNNEL) & low & ~held)[:, None]
+    leave = ((off > FUNNEL) & low)[:, None]
     off = off + LEVER * jnp.abs(twist)
     height = geometry.funnel(off, aligned=ALIGNED, wide=FUNNEL)
     height = HOVER * jnp.where(stay | self._hand.is_open(state), height, 1.0)
@@ -151,9 +148,9 @@ class PlacePlate(TableTask):
 
   def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:
     """The plate is in the box, on its floor, at rest, and the gripper has let go."""
-    speed = geometry.norm(state.qvel[:, self._plate_dof : self._plate_dof + 3])
-    distance = geometry.norm(self._hand.point(kinematics) - self._edge(state))
-    return self._in_box(state) & (speed < REST_SPEED) & (distance > CLEAR)
+    at_rest = geometry.is_at_rest(state.qvel[:, self._plate_dof : self._plate_dof + 6])
+    distance = geometry.norm(self._hand.point(kinematics) - self._plate_pos(state))
+    return self._in_box(state) & at_rest & (distance > RADIUS - GRASP_INSET + CLEAR)
 
   def objects(self, state: PhysicsState) -> Array:
     """f32[worlds, 12]: centre of the plate and a point 5 cm along its axis, the same
@@ -203,7 +200,7 @@ class PlacePlate(TableTask):
     mat = geometry.turn_z(geometry.yaw(state.mocap_quat[:, self._goal]))
     shift = self._plate_pos(state) - state.mocap_pos[:, self._goal]
     local = jnp.einsum("wji,wj->wi", mat, shift)
-    tilt = self._axis(state)[:, 2]
-    lowest = shift[:, 2] - RADIUS * jnp.sqrt(1 - tilt.clip(-1, 1) ** 2)
+    tilt = jnp.abs(self._axis(state)[:, 2]).clip(0.0, 1.0)
+    lowest = shift[:, 2] - RADIUS * jnp.sqrt(1 - tilt**2) - THICKNESS / 2 * tilt
     between = (jnp.abs(local[:, :2]) < jnp.asarray(INSIDE)).all(-1)
     return between & (lowest < ON_FLOOR)

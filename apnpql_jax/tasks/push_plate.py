@@ -21,6 +21,7 @@ import numpy as np
 
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
+from apnpql_jax.tasks import geometry
 from apnpql_jax.tasks.table import TableTask
 from apnpql_jax.tasks.task import ResetDraw, register
 from apnpql_jax.types import Array
@@ -33,9 +34,6 @@ MIN_DISTANCE = 0.12
 
 GOAL_TOLERANCE = 0.03
 """m; the mark's radius exceeds the plate's by this much: solved = inside the mark."""
-
-REST_SPEED = 0.05
-"""m/s; slower than this the plate stops within 0.7 mm (v^2 / 2 mu g, mu = 0.2)."""
 
 HOVER_HEIGHT = 0.08
 """m; tool height at which the finger tips clear the rim (34 mm) and the camera too."""
@@ -84,7 +82,7 @@ class PushPlate(TableTask):
     low, high = np.array(WORKSPACE).T
     plate, goal = rng.uniform(low, high, (2, count, 2))
     while (near := np.linalg.norm(plate - goal, axis=-1) < MIN_DISTANCE).any():
-      goal[near] = rng.uniform(low, high, (int(near.sum()), 2))
+      plate[near], goal[near] = rng.uniform(low, high, (2, int(near.sum()), 2))
     qpos = self.draw_qpos(rng, count)
     qpos[:, self._plate : self._plate + 2] = plate
     yaw = rng.uniform(-np.pi, np.pi, count)
@@ -104,34 +102,29 @@ class PushPlate(TableTask):
     plate, goal = self._plate_xy(state), self._goal_xy(state)
     inside = self._inside(tool, plate)[:, None]
     above = (tool[:, 2] > CLEAR)[:, None]
-    off = (_norm(tool[:, :2] - plate) - ALIGNED) / (FUNNEL - ALIGNED)
+    off = (geometry.norm(tool[:, :2] - plate) - ALIGNED) / (FUNNEL - ALIGNED)
     funnel = DRAG_HEIGHT + (HOVER_HEIGHT - DRAG_HEIGHT) * off.clip(0.0, 1.0)
 
-    def waypoint(xy, height):
-      return jnp.stack(
-        [xy[:, 0], xy[:, 1], jnp.broadcast_to(height, xy[:, 0].shape)], -1
-      )
-
-    rise = waypoint(tool[:, :2], HOVER_HEIGHT)
-    onto_plate = jnp.where(above | (off < 1)[:, None], waypoint(plate, funnel), rise)
-    to_object = jnp.where(inside, waypoint(plate, DRAG_HEIGHT), onto_plate)
+    rise = geometry.up(tool[:, :2], HOVER_HEIGHT)
+    onto_plate = jnp.where(above | (off < 1)[:, None], geometry.up(plate, funnel), rise)
+    to_object = jnp.where(inside, geometry.up(plate, DRAG_HEIGHT), onto_plate)
     # Full speed from halfway down: the tip's height is what a policy knows least.
     depth = (2 * (LOW - tool[:, 2]) / (LOW - DRAG_HEIGHT)).clip(0.0, 1.0)
     drag = goal - plate
-    reach = depth * LOOKAHEAD / jnp.maximum(_norm(drag), LOOKAHEAD)
+    reach = depth * LOOKAHEAD / jnp.maximum(geometry.norm(drag), LOOKAHEAD)
     drag = drag * reach[:, None]
-    over_goal = jnp.where(above, waypoint(goal, HOVER_HEIGHT), rise)
-    to_goal = jnp.where(inside, waypoint(tool[:, :2] + drag, DRAG_HEIGHT), over_goal)
+    over_goal = jnp.where(above, geometry.up(goal, HOVER_HEIGHT), rise)
+    to_goal = jnp.where(inside, geometry.up(tool[:, :2] + drag, DRAG_HEIGHT), over_goal)
     positions = self.with_neutral(to_object, to_goal)
     return positions, jnp.broadcast_to(self._neutral_mat, (*positions.shape, 3))
 
   def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:
     """The plate's centre is within 3 cm of the goal's, flat on the table, at rest."""
     del kinematics
-    distance = _norm(self._plate_xy(state) - self._goal_xy(state))
-    speed = _norm(state.qvel[:, self._plate_dof : self._plate_dof + 3])
+    distance = geometry.norm(self._plate_xy(state) - self._goal_xy(state))
+    twist = state.qvel[:, self._plate_dof : self._plate_dof + 6]
     on_table = state.qpos[:, self._plate + 2] < 0.01
-    return (distance < GOAL_TOLERANCE) & (speed < REST_SPEED) & on_table
+    return (distance < GOAL_TOLERANCE) & geometry.is_at_rest(twist) & on_table
 
   def objects(self, state: PhysicsState) -> Array:
     """f32[worlds, 6]: xyz of plate and goal, m."""
@@ -154,8 +147,4 @@ class PushPlate(TableTask):
     return state.mocap_pos[:, self._goal, :2]
 
   def _inside(self, tool: Array, plate: Array) -> Array:
-    return (tool[:, 2] < CAPTURE) & (_norm(tool[:, :2] - plate) < INSIDE)
-
-
-def _norm(x: Array) -> Array:
-  return jnp.sqrt((x**2).sum(-1) + 1e-12)
+    return (tool[:, 2] < CAPTURE) & (geometry.norm(tool[:, :2] - plate) < INSIDE)

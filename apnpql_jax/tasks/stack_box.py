@@ -58,9 +58,6 @@ STACKED_OFF = 0.02
 STACKED_HEIGHT = 0.005
 """m; tolerance of the height difference of one side."""
 
-REST_SPEED = 0.05
-"""m/s; above float32 contact noise."""
-
 CLEAR = 0.05
 """m; the gripper has let go when the tool is this far from the box."""
 
@@ -83,7 +80,7 @@ class StackBox(TableTask):
     low, high = np.array(WORKSPACE).T
     yellow, blue = rng.uniform(low, high, (2, count, 2))
     while (near := np.linalg.norm(yellow - blue, axis=-1) < MIN_DISTANCE).any():
-      blue[near] = rng.uniform(low, high, (int(near.sum()), 2))
+      yellow[near], blue[near] = rng.uniform(low, high, (2, int(near.sum()), 2))
     qpos = self.draw_qpos(rng, count)
     for address, spot in ((self._yellow, yellow), (self._blue, blue)):
       half = rng.uniform(-MAX_YAW, MAX_YAW, count) / 2
@@ -106,7 +103,7 @@ class StackBox(TableTask):
     low = (tool[:, 2] < TRAVEL - 0.03)[:, None]
 
     off = geometry.norm(tool[:, :2] - yellow[:, :2])
-    leave = (off > FUNNEL)[:, None] & low & ~held[:, None]
+    leave = (off > FUNNEL)[:, None] & low
     off = off + LEVER * jnp.abs(twist)
     height = geometry.funnel(off, aligned=ALIGNED, wide=FUNNEL)
     height = HOVER * jnp.where(stay | self._hand.is_open(state), height, 1.0)
@@ -132,11 +129,9 @@ class StackBox(TableTask):
     yellow, blue = self._yellow_pos(state), self._blue_pos(state)
     stacked = self._stacked(state, STACKED_OFF, STACKED_HEIGHT)
     on_table = blue[:, 2] < 0.6 * SIDE
-    speeds = [
-      geometry.norm(state.qvel[:, dof : dof + 3])
-      for dof in (self._yellow_dof, self._blue_dof)
-    ]
-    at_rest = jnp.maximum(*speeds) < REST_SPEED
+    at_rest = geometry.is_at_rest(
+      state.qvel[:, self._yellow_dof : self._yellow_dof + 6]
+    ) & geometry.is_at_rest(state.qvel[:, self._blue_dof : self._blue_dof + 6])
     tool = kinematics.site_xpos[:, self.scene.tool_site]
     return stacked & on_table & at_rest & (geometry.norm(tool - yellow) > CLEAR)
 
@@ -178,7 +173,7 @@ class StackBox(TableTask):
   def _yaw(self, state: PhysicsState, address: int) -> Array:
     """Heading of the box's face nearest to the world's x axis."""
     quat = state.qpos[:, address + 3 : address + 7]
-    return geometry.fold(geometry.yaw(quat), np.pi / 2)
+    return geometry.fold(geometry.level_heading(quat), np.pi / 2)
 
   def _stacked(self, state: PhysicsState, off: float, height: float) -> Array:
     shift = self._yellow_pos(state) - self._blue_pos(state)

@@ -1,0 +1,94 @@
+"""Worlds of one batch with different models: both engines, kinematics, images."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+import render_oracles
+
+from apnpql_jax.presets import mjcf_path
+from apnpql_jax.render import CameraSpec, Geoms, render
+from apnpql_jax.sim import physics
+from apnpql_jax.sim.kinematics import make_kinematics
+from apnpql_jax.tasks import flip_cup, make_task
+
+WORLDS = 6
+
+
+@pytest.fixture(scope="module")
+def task():
+  return make_task("flip_cup")
+
+
+@pytest.fixture(scope="module")
+def models(task) -> list[mujoco.MjModel]:
+  """The variants, compiled here, apart from the code under test."""
+  models = []
+  for shape in flip_cup.SHAPES:
+    spec = mujoco.MjSpec.from_file(str(mjcf_path("flip_cup")))
+    flip_cup.shape_cup(spec, *shape)
+    models.append(spec.compile())
+  return models
+
+
+@pytest.fixture(scope="module")
+def state(task) -> physics.PhysicsState:
+  """Cups of all shapes, each twice, 1 cm above the table and a little tilted."""
+  draw = task.sample_resets(np.random.default_rng(0), WORLDS)
+  variant = np.arange(WORLDS) % len(flip_cup.SHAPES)
+  address, _ = task.scene.free_joint("cup")
+  heights = np.array(flip_cup.SHAPES)[variant, 2]
+  draw.qpos[:, address + 2] = heights / 2 + 0.01
+  draw = draw._replace(variant=variant)
+  return physics.initial_state(task.scene, *map(jnp.asarray, draw))
+
+
+@pytest.mark.parametrize("name", ["native", "mjx"])
+def test_each_world_moves_as_its_own_model(task, models, state, name):
+  engine = physics.make_physics(name, task.scene, substeps=30)
+  moved = jax.jit(engine.step)(state, jnp.zeros((WORLDS, 6)), jnp.zeros(WORLDS))
+  address, _ = task.scene.free_joint("cup")
+  for world in range(WORLDS):
+    model = models[world % len(models)]
+    data = mujoco.MjData(model)
+    data.qpos[:] = np.asarray(state.qpos[world])
+    data.mocap_pos[:] = np.asarray(state.mocap_pos[world])
+    for _ in range(30):
+      mujoco.mj_forward(model, data)
+      data.ctrl[:6] = data.qfrc_bias[:6]  # Holds the arm; the cup is what counts.
+      mujoco.mj_step(model, data)
+    cup = slice(address, address + 7)
+    np.testing.assert_allclose(moved.qpos[world, cup], data.qpos[cup], atol=5e-4)
+
+
+def test_each_world_is_seen_in_its_own_shape(task, models, state):
+  kinematics = jax.jit(make_kinematics(task.scene))(state)
+  scene, size = task.scene, (72, 96)
+  camera = scene.id("camera", "global")
+  image = render(
+    Geoms.from_model(scene.model),
+    CameraSpec.from_model(scene.model, "global", height=size[0], width=size[1]),
+    kinematics.geom_xpos,
+    kinematics.geom_xmat,
+    kinematics.cam_xpos[:, camera],
+    kinematics.cam_xmat[:, camera],
+    geom_size=kinematics.geom_size,
+    outputs=("segmentation",),
+  )
+  for world in range(WORLDS):
+    model = models[world % len(models)]
+    data = mujoco.MjData(model)
+    data.qpos[:] = np.asarray(state.qpos[world])
+    data.mocap_pos[:] = np.asarray(state.mocap_pos[world])
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(kinematics.geom_xpos[world], data.geom_xpos, atol=2e-6)
+    expected = render_oracles.cast_rays(model, data, "global", *size)[0]
+    # The boxes of a cup share their tops, where either may be seen.
+    walls = [model.geom(f"cup_{i}").id for i in range(4)]
+    seen = np.asarray(image.segmentation[world])
+    same = (seen == expected) | (np.isin(seen, walls) & np.isin(expected, walls))
+    assert np.isin(expected, walls).sum() > 60
+    assert (~same).sum() <= 3  # Rays along an edge, in single precision.
