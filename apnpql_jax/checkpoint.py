@@ -138,6 +138,34 @@ def best_step(run_dir: Path) -> int | None:
   return _best(_rates(run_dir))
 
 
+def check(run_dir: Path, step: int | None, *, config: TrainConfig | None = None) -> int:
+  """Refuses a checkpoint that cannot be restored, before anything else is built.
+
+  Args:
+    run_dir: the run folder.
+    step: the newest if None.
+    config: as of ``restore``.
+
+  Returns:
+    the step.
+
+  Raises:
+    ConfigError: there is no such checkpoint, or it belongs to another configuration
+      or format.
+  """
+  step = _existing_step(run_dir, step)
+  meta = _read_meta(run_dir, step)
+  if config is not None:
+    diff = config_diff(config_from_json(json.dumps(meta["config"])), config)
+    diff = {field: pair for field, pair in diff.items() if field not in MAY_CHANGE}
+    if diff:
+      raise ConfigError(
+        f"checkpoint {step} of {str(run_dir)!r} belongs to other settings: "
+        f"{format_diff(diff)}"
+      )
+  return step
+
+
 def restore(
   run_dir: Path,
   step: int | None,
@@ -159,14 +187,9 @@ def restore(
     ConfigError: there is no such checkpoint, it belongs to another configuration or
       format, it holds other leaves than the example, or its files cannot be read.
   """
-  step = _existing_step(run_dir, step)
+  step = check(run_dir, step, config=config)
   name = f"checkpoint {step} of {str(run_dir)!r}"
   meta = _read_meta(run_dir, step)
-  if config is not None:
-    diff = config_diff(config_from_json(json.dumps(meta["config"])), config)
-    diff = {field: pair for field, pair in diff.items() if field not in MAY_CHANGE}
-    if diff:
-      raise ConfigError(f"{name} belongs to other settings: {format_diff(diff)}")
   _check_leaves(name, meta["leaves"], leaves.describe(example_state))
   state = _read(name, _folder(run_dir), step, leaves.abstract(example_state))
   return leaves.to_typed(state, meta["key_impls"])

@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
       return 0
     check_name("command", args[0], list(_COMMANDS))
     kind, command, show = _COMMANDS[args[0]]
-    parsed = parse(kind, args[0], args[1:])
+    parsed = parse(kind, args[0], args[1:], default=_preset_named(kind, args))
     with _only_json(parsed.json) as write:
       result = command(parsed, args[1:])
       write(_to_json(result) if parsed.json else show(result))
@@ -132,20 +132,30 @@ def collect(args: Collect, argv: Sequence[str]) -> Json:
 
 
 def list_names(args: List, argv: Sequence[str]) -> Json:
-  """The names that other commands accept, and what each task costs in MJX."""
-  del args, argv
+  """The names that other commands accept, or what the contacts of each task cost."""
+  del argv
   from apnpql_jax import tasks
   from apnpql_jax.agents import algorithms
-  from apnpql_jax.sim.mjx import contact_budget
 
   names = tasks.task_names()
+  if args.contacts:
+    from apnpql_jax.contact_report import contact_report
+
+    return {name: contact_report(tasks.make_task(name)) for name in names}
   return {
     "tasks": names,
-    "mjx_budget": {name: contact_budget(tasks.make_task(name).scene) for name in names},
     "presets": presets.preset_names(),
     "algorithms": list(algorithms.ALGORITHMS),
     "backends": list(BACKENDS),
   }
+
+
+def _preset_named(kind: type[Any], args: Sequence[str]) -> Train | None:
+  """The defaults that ``train PRESET --help`` has to show."""
+  named = [arg for arg in args if arg in presets.preset_names()]
+  if kind is not Train or not named:
+    return None
+  return Train(config=presets.load_preset(named[0]))
 
 
 def _check_registered(config: TrainConfig) -> None:
@@ -222,13 +232,15 @@ def _show_figures(result: Json) -> str:
 
 
 def _show_names(result: Json) -> str:
-  budgets = [
-    f"{task} ({budget['contacts']} contacts, {budget['constraint_rows']} rows)"
-    for task, budget in result["mjx_budget"].items()
-  ]
-  lists = result | {"mjx_budget": budgets}
-  width = max(map(len, lists))
-  return "\n".join(f"{kind:<{width}}  {', '.join(v)}" for kind, v in lists.items())
+  width = max(map(len, result))
+  lines = []
+  for kind, names in result.items():
+    if isinstance(names, dict):  # A contact report.
+      names = [
+        f"{value:,.0f} {name.replace('_', ' ')}" for name, value in names.items()
+      ]
+    lines.append(f"{kind:<{width}}  {', '.join(names)}")
+  return "\n".join(lines)
 
 
 def _help() -> str:

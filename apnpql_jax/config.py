@@ -139,11 +139,11 @@ class AgentConfig:
   """Limit of the prior's standard deviation of each joint, rad/s."""
 
   min_prob: float = 0.05
-  """Smallest weight of a component and probability of a gripper command in the prior,
-  so that it never stops proposing one."""
+  """Smallest probability of a gripper command in the prior, and weight of a component
+  at its floor while another is at its limit, so that none is ever ruled out."""
 
   initial_alpha: float = 0.1
-  """Temperature before training, in units of return."""
+  """Temperature before training, on top of min_alpha, in units of return."""
 
   min_alpha: float = 1e-3
   """Floor of the temperature, in units of return: smaller differences of value are

@@ -14,7 +14,7 @@ from flax import struct
 import jax
 import jax.numpy as jnp
 
-from apnpql_jax.config import EnvConfig
+from apnpql_jax.config import ConfigError, EnvConfig
 from apnpql_jax.primitives import tracking
 from apnpql_jax.primitives.bank import ResetBank, load_bank
 from apnpql_jax.render import CameraSpec, Geoms, Lighting, render
@@ -58,17 +58,14 @@ class Env:
       bank: its reset states.
     """
     scene = task.scene
-    substeps = round(config.control_period_s / scene.model.opt.timestep)
+    substeps = _substeps(config, scene)
     self.config = config
     self.task = task
     self.physics = physics.make_physics(config.backend, scene, substeps=substeps)
     self._bank = bank
     self._chain = arm.make_chain(scene)
     self._kinematics = make_kinematics(scene)
-    self._cameras = (
-      camera_renderer(scene, "global", GLOBAL_SIZE),
-      camera_renderer(scene, "wrist", WRIST_SIZE),
-    )
+    self._cameras = _make_cameras(scene)
 
   @property
   def bank_split(self) -> int:
@@ -174,10 +171,35 @@ class Env:
 
 
 def make_env(config: EnvConfig) -> Env:
-  """The worlds of ``config.task``; builds the reset bank on first use."""
+  """The worlds of ``config.task``; builds the reset bank on first use.
+
+  Raises:
+    ConfigError: unknown task or backend, a scene that cannot be simulated or drawn, a
+      control period that is not made of whole steps, or no resets within reach.
+  """
   task = make_task(config.task)
+  _make_cameras(task.scene)  # Refuses what cannot be drawn before the bank is built.
   bank, _ = load_bank(task, config.bank_rows)
   return Env(config, task, bank)
+
+
+def _substeps(config: EnvConfig, scene: Scene) -> int:
+  """Physics steps per control period."""
+  timestep = scene.model.opt.timestep
+  substeps = round(config.control_period_s / timestep)
+  if substeps < 1 or abs(substeps * timestep - config.control_period_s) > 1e-9:
+    raise ConfigError(
+      f"env.control_period_s={config.control_period_s} must be a multiple of the "
+      f"scene's timestep, {timestep} s"
+    )
+  return substeps
+
+
+def _make_cameras(scene: Scene) -> tuple[Renderer, Renderer]:
+  return (
+    camera_renderer(scene, "global", GLOBAL_SIZE),
+    camera_renderer(scene, "wrist", WRIST_SIZE),
+  )
 
 
 def camera_renderer(scene: Scene, name: str, size: tuple[int, int]) -> Renderer:

@@ -113,7 +113,7 @@ def evaluate_run(
   """
   began = time.monotonic()
   config = run_folder.open_run(run_dir).config
-  step = checkpoint.latest_step(run_dir)
+  step = checkpoint.check(run_dir, None, config=config)
   env_config = dataclasses.replace(config.env, backend=backend or config.env.backend)
   env, agent = make_env(env_config), make_agent(config.agent)
   example = jax.eval_shape(lambda: initial_state(config, env, agent))

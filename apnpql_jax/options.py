@@ -106,6 +106,10 @@ class Collect:
 class List:
   """Names the tasks, presets, algorithms and backends."""
 
+  contacts: _Flag = False
+  """Report pairs, contact slots, constraint rows and physics steps per second of every
+  scene instead. Takes minutes, as MJX has to compile each."""
+
   json: _Flag = False
   """Print one JSON object on standard output and nothing else there."""
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax.env import Env, EnvState, camera_renderer
+from apnpql_jax.env import GLOBAL_SIZE, WRIST_SIZE, Env, EnvState, camera_renderer
 from apnpql_jax.render.video import tile, write_video
 from apnpql_jax.rollout import Policy
 from apnpql_jax.types import Array
@@ -26,24 +26,37 @@ def record_episodes(env: Env, policy: Policy, path: Path) -> None:
     policy: what acts.
     path: of the file to write; its folder is made.
   """
+  frames = np.concatenate(film(env, policy))
+  path.parent.mkdir(parents=True, exist_ok=True)
+  write_video(path, frames, fps=1 / env.config.control_period_s)
+
+
+def film(
+  env: Env, policy: Policy, *, view_size: tuple[int, int] = VIEW_SIZE
+) -> list[np.ndarray]:
+  """Plays held-out episodes; u8[T, H, W, 3] each, from the first to the last instant.
+
+  Args:
+    env: the worlds.
+    policy: what acts.
+    view_size: height and width of the larger view, pixels.
+  """
   rows = env.bank_split + jnp.arange(EPISODES)
   states, running = jax.jit(lambda key: _play(env, policy, rows, key))(
     jax.random.key(0)
   )
   cameras = (
-    camera_renderer(env.task.scene, "global", VIEW_SIZE),
-    camera_renderer(env.task.scene, "global", (72, 96)),
-    camera_renderer(env.task.scene, "wrist", (36, 64)),
+    camera_renderer(env.task.scene, "global", view_size),
+    camera_renderer(env.task.scene, "global", GLOBAL_SIZE),
+    camera_renderer(env.task.scene, "wrist", WRIST_SIZE),
   )
   draw = jax.jit(lambda physics: [env.view(camera, physics) for camera in cameras])
-  frames = []
+  episodes = []
   for episode in range(EPISODES):
     steps = int(running[:, episode].sum())
     physics = jax.tree.map(lambda x: x[:, episode], states)  # noqa: B023
-    images = [np.asarray(view)[: steps + 1] for view in draw(physics)]
-    frames.append(tile(images))
-  path.parent.mkdir(parents=True, exist_ok=True)
-  write_video(path, np.concatenate(frames), fps=1 / env.config.control_period_s)
+    episodes.append(tile([np.asarray(view)[: steps + 1] for view in draw(physics)]))
+  return episodes
 
 
 def _play(env: Env, policy: Policy, rows: Array, key: Array) -> tuple[EnvState, Array]:

@@ -72,11 +72,12 @@ def _set_threads() -> None:
       pinned = True
       if int(text) < MIN_THREADS:
         os.environ[name] = str(MIN_THREADS)
-  if not pinned and _cores() < MIN_THREADS:
+  if not pinned and cores() < MIN_THREADS:
     os.environ["NPROC"] = str(MIN_THREADS)
 
 
-def _cores() -> int:
+def cores() -> int:
+  """CPU cores this process may use."""
   if hasattr(os, "sched_getaffinity"):  # Not on macOS.
     return len(os.sched_getaffinity(0))
   return os.cpu_count() or 1

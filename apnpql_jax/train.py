@@ -11,6 +11,7 @@ import functools
 import math
 from pathlib import Path
 import signal
+import sys
 import time
 from typing import Any
 
@@ -52,6 +53,8 @@ def train(
     KeyboardInterrupt: SIGINT or SIGTERM came; the state is saved.
   """
   check_sinks(config.sinks)
+  if resume:
+    checkpoint.check(run_dir, None, config=config)
   env, agent = make_env(config.env), make_agent(config.agent)
   build = functools.partial(initial_state, config, env, agent)
   example = jax.eval_shape(build)
@@ -60,9 +63,11 @@ def train(
     folder = run_folder.open_run(run_dir)
     state = checkpoint.restore(run_dir, None, example, config=config)
   else:
+    _say("collecting the expert's replay")
     state = build()
     folder = run_folder.create(run_dir, config, overwrite=overwrite)
   start = int(state.env_steps) if resume else None
+  _say(f"run folder {folder.path}; compiling, which takes a minute or two")
   with (
     MetricWriter(
       folder.path,
@@ -80,6 +85,7 @@ def train(
       config, make_iteration(config, env, agent), state, reporter, saver, caught
     )
   if caught:
+    _say(f"saved at step {int(state.env_steps):,}; to go on: --resume {run_dir}")
     raise KeyboardInterrupt
   return {
     "run": str(folder.path),
@@ -186,6 +192,10 @@ def caught_signals() -> Generator[list[int]]:
   finally:
     for each, old in previous.items():
       signal.signal(each, old)
+
+
+def _say(text: str) -> None:
+  print(text, file=sys.stderr, flush=True)
 
 
 def _passed(before: int, now: int, every: int) -> bool:

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 BACKENDS = ("auto", "mjx", "native")
 OBSERVATIONS = ("pixels", "state")
 
+MIN_BANK_ROWS = 16
+
 _PIXEL_BYTES = 3 * (72 * 96 + 36 * 64)
 _OTHER_BYTES = 4 * (21 + 3 + 7 + 18 + 1) + 2
 """Robot state, tool, action, primitive labels, reward (f32) and the two end flags."""
@@ -91,6 +93,11 @@ def _validate_ranges(config: TrainConfig) -> None:
   for name in _NOT_NEGATIVE:
     if values[name] < 0:
       raise ConfigError(f"{name}={values[name]} must not be negative")
+  if config.env.bank_rows < MIN_BANK_ROWS:
+    raise ConfigError(
+      f"env.bank_rows={config.env.bank_rows} must be at least {MIN_BANK_ROWS}: a "
+      "quarter of them is held out for evaluation"
+    )
   if config.env.episode_steps < 1:
     raise ConfigError(
       f"env.time_limit_s={config.env.time_limit_s} is shorter than one control "

@@ -25,7 +25,7 @@ CONFIG = TrainConfig(
   replay=ReplayConfig(
     capacity=25_600, expert_steps=6_400, expert_share=0.5, batch_size=64
   ),
-  total_steps=40_960,
+  total_steps=30_720,
   rollout_length=4,
   updates_per_iteration=32,
   eval_every=5_120,

@@ -74,7 +74,7 @@ def test_projection_of_an_unmoved_distribution_is_itself():
 
 
 def test_expectation_over_actions_commutes_with_the_projection():
-  """Both sides of paper Eq. 7."""
+  """Both sides of paper Eq. 8."""
   rng = np.random.default_rng(4)
   _, reward, discount = random_case(4, batch=5)
   probs = jnp.asarray(rng.dirichlet(np.ones(51), size=(120, 5)), jnp.float32)

@@ -14,7 +14,6 @@ import pytest
 from apnpql_jax import presets
 from apnpql_jax.cli import _plain
 from apnpql_jax.config import BACKENDS, TrainConfig, config_to_json
-from apnpql_jax.tasks import make_task
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -122,12 +121,8 @@ def test_list_prints_one_json_object_and_nothing_else(tmp_path):
   assert done.returncode == 0, done.stderr
   names = json.loads(done.stdout)
   assert done.stdout.count("\n") == 1
-  assert list(names) == ["tasks", "mjx_budget", "presets", "algorithms", "backends"]
+  assert list(names) == ["tasks", "presets", "algorithms", "backends"]
   assert "push_plate" in names["tasks"]
-  budget = names["mjx_budget"]["push_plate"]
-  model = make_task("push_plate").scene.model
-  assert budget["contacts"] >= model.npair
-  assert budget["constraint_rows"] >= budget["contacts"] * model.pair_dim.min()
   assert "push_plate" in names["presets"]
   assert "ap_npql" in names["algorithms"]
   assert names["backends"] == list(BACKENDS)

@@ -171,7 +171,7 @@ def bellman_target(
   batch: Transition,
   key: Array,
 ) -> Array:
-  """Target distribution f32[B, n] from the target network at s_t (paper Eq. 7)."""
+  """Target distribution f32[B, n] from the target network at s_t (paper Eq. 8)."""
   phi_t = networks.features(target_params, batch.observation_t)
   candidates_t = algorithm.policy(
     networks,

@@ -21,7 +21,7 @@ def weighted_mean(losses: Array, weight: Array) -> Array:
 
 
 def ap_loss(predicted: Array, label: Array, *, delta: float) -> Array:
-  """Behaviour cloning of the action primitives, L^ap (paper Eq. 9).
+  """Behaviour cloning of the action primitives, L^ap (paper Eq. 10).
 
   Huber loss: quadratic below ``delta`` (rad/s), where the arm closes in on its
   target, and linear above, where labels of distant targets saturate.
@@ -41,7 +41,7 @@ def ap_loss(predicted: Array, label: Array, *, delta: float) -> Array:
 def value_target(
   logits_t: Array, weights_t: Array, reward_t: Array, discount_t: Array, atoms: Array
 ) -> Array:
-  """Distributional N-step target E_{a ~ q}[z-bar] (paper Eq. 7, right side).
+  """Distributional N-step target E_{a ~ q}[z-bar] (paper Eq. 8, right side).
 
   The expectation over candidates comes before the projection, which is linear.
 
@@ -61,7 +61,7 @@ def value_target(
 
 
 def q_loss(logits_tm1: Array, target: Array) -> Array:
-  """Cross-entropy of Z(s_tm1, a_tm1) to the target, L^Q (paper Eq. 7).
+  """Cross-entropy of Z(s_tm1, a_tm1) to the target, L^Q (paper Eq. 8).
 
   Args:
     logits_tm1: f32[*b, n].
@@ -74,7 +74,7 @@ def q_loss(logits_tm1: Array, target: Array) -> Array:
 
 
 def alpha_loss(q_tm1: Array, alpha_tm1: Array, *, epsilon: float) -> Array:
-  """Dual of the KL limit, to be minimised over alpha(s) (paper Eq. 6).
+  """Dual of the KL limit, to be minimised over alpha(s) (paper Eq. 7).
 
   Args:
     q_tm1: f32[S, *b] values of candidates drawn from the prior; not trained.
@@ -91,7 +91,7 @@ def alpha_loss(q_tm1: Array, alpha_tm1: Array, *, epsilon: float) -> Array:
 def m_step_loss(
   prior: gmm.GripperGMM, samples: Array, weights: Array, nu: Array
 ) -> Array:
-  """Fits the prior to q and keeps it broad, L^M (paper Eq. 10).
+  """Fits the prior to q and keeps it broad, L^M (paper Eq. 9).
 
   -sum_i w_i log b(a_i) - nu H(b): the first term is KL(q || b) up to a constant.
   The paper prints + nu H(b) but introduces the term for exploration, so entropy is
@@ -112,7 +112,7 @@ def m_step_loss(
 
 
 def nu_loss(nu: Array, entropy: Array, *, epsilon_nu: float) -> Array:
-  """Dual of the entropy floor, nu (H(b) - epsilon_nu) (text below paper Eq. 10).
+  """Dual of the entropy floor, nu (H(b) - epsilon_nu) (text below paper Eq. 9).
 
   Minimised over nu >= 0: nu grows while the entropy is below its floor.
 

@@ -41,7 +41,7 @@ def non_parametric(
   *,
   num_samples: int,
 ) -> Candidates:
-  """q = b exp(Q / alpha) / Z by self-normalised importance sampling (paper Eq. 5).
+  """q = b exp(Q / alpha) / Z by self-normalised importance sampling (paper Eq. 6).
 
   Args:
     networks: what predicts.

@@ -15,7 +15,7 @@ Array = jax.Array
 
 
 def importance_weights(q_values: Array, alpha: Array) -> Array:
-  """Self-normalised importance weights softmax(Q / alpha), f32[S, *b] (Eq. 5)."""
+  """Self-normalised importance weights softmax(Q / alpha), f32[S, *b] (Eq. 6)."""
   return jax.nn.softmax(q_values / alpha[None], axis=0)
 
 
@@ -32,7 +32,7 @@ def effective_sample_size(weights: Array) -> Array:
 
 
 def dual(q_values: Array, alpha: Array, *, epsilon: float) -> Array:
-  """Dual of max_q E_q[Q] s.t. KL(q || b) <= epsilon (paper Eq. 6), f32[*b].
+  """Dual of max_q E_q[Q] s.t. KL(q || b) <= epsilon (paper Eq. 7), f32[*b].
 
   alpha epsilon + alpha log mean_i exp(Q_i / alpha). Convex in alpha; its slope is
   epsilon - KL(q || b), so the minimum is where the limit holds exactly.

@@ -23,7 +23,7 @@ def project(probs: Array, reward: Array, discount: Array, atoms: Array) -> Array
   """Projects the distribution of ``reward + discount * z`` back onto the atoms.
 
   The projection is linear in ``probs``. So the expectation over candidate actions
-  is taken first, and one projection per state is enough (paper Eq. 7, right side).
+  is taken first, and one projection per state is enough (paper Eq. 8, right side).
 
   Args:
     probs: f32[*b, n] distribution of the return z at the bootstrap state, already

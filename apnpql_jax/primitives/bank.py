@@ -24,8 +24,9 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
+from apnpql_jax.config import ConfigError
 from apnpql_jax.primitives import ik
-from apnpql_jax.runtime import cache_dir
+from apnpql_jax.runtime import cache_dir, cores
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.sim.native import NativePhysics
@@ -39,6 +40,8 @@ VERSION = 2
 
 SEED = 0
 CHUNK = 32
+MAX_DRAWS = 20
+"""Draws per row after which a task counts as one without usable resets."""
 SETTLE_PERIODS = 4
 """Control periods of 0.15 s at rest before a draw is accepted."""
 SETTLE_SPEED = 0.05
@@ -71,8 +74,8 @@ class BankReport:
   drawn: int = 0
   rejected_restless: int = 0
   rejected_unreachable: int = 0
-  max_position_residual: float = 0.0
-  max_rotation_residual: float = 0.0
+  max_position_residual: float = 0.0  # m
+  max_rotation_residual: float = 0.0  # rad
 
 
 def load_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
@@ -97,14 +100,19 @@ def build_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
   # Spawned workers: forking a process in which XLA threads run can deadlock.
   context = multiprocessing.get_context("spawn")
   with (
-    concurrent.futures.ProcessPoolExecutor(os.cpu_count(), context) as pool,
+    concurrent.futures.ProcessPoolExecutor(cores(), context) as pool,
     Progress(console=Console(stderr=True)) as progress,
   ):
     bar = progress.add_task(f"reset bank of {task.name}", total=rows)
     while (missing := rows - sum(bank.rows for bank in kept)) > 0:
-      settled = _settled(task, rng, max(missing, CHUNK), report)
+      progress.update(bar, completed=rows - missing)
+      if report.drawn > MAX_DRAWS * rows:
+        raise ConfigError(f"task {task.name!r} has too few usable resets: {report}")
+      state, variant = _settled(task, rng, max(missing, CHUNK), report)
+      if not len(variant):
+        continue
       solved = _solve_targets(
-        task, *settled, pool, report, lambda n: progress.advance(bar, n)
+        task, state, variant, pool, report, lambda n: progress.advance(bar, n)
       )
       kept.append(jax.tree.map(lambda x: x[:missing], solved))
   return jax.tree.map(lambda *parts: jnp.concatenate(parts), *kept), report
@@ -134,7 +142,7 @@ def _solve_targets(
   starts = np.asarray(state.qpos[:, task.scene.arm_qpos])
   chunks = [slice(i, i + CHUNK) for i in range(0, len(starts), CHUNK)]
   futures = [
-    pool.submit(_solve_chunk, starts[c], positions[c], rotations[c]) for c in chunks
+    pool.submit(ik.solve_all, starts[c], positions[c], rotations[c]) for c in chunks
   ]
   for future in concurrent.futures.as_completed(futures):
     advance(len(future.result()[0]))
@@ -145,7 +153,7 @@ def _solve_targets(
   reached = (residuals < [ik.POSITION_TOLERANCE, ik.ROTATION_TOLERANCE]).all((1, 2))
   reached &= np.abs(targets - starts[:, None]).max((1, 2)) < MAX_TRAVEL
   report.rejected_unreachable += int((~reached).sum())
-  worst = residuals[reached].max((0, 1))
+  worst = residuals[reached].max((0, 1), initial=0.0)
   report.max_position_residual = max(report.max_position_residual, float(worst[0]))
   report.max_rotation_residual = max(report.max_rotation_residual, float(worst[1]))
   return ResetBank(
@@ -155,20 +163,6 @@ def _solve_targets(
     variant=variant[reached],
     targets=jnp.asarray(targets[reached], jnp.float32),
   )
-
-
-def _solve_chunk(starts, positions, rotations) -> tuple[np.ndarray, np.ndarray]:
-  """Targets f64[n, 3, 6] and residuals f64[n, 3, 2]; runs in a worker process."""
-  solver = ik.IkSolver()
-  results = [
-    [solver.solve(start, pos, mat) for pos, mat in zip(p, r, strict=True)]
-    for start, p, r in zip(starts, positions, rotations, strict=True)
-  ]
-  q = np.array([[result.q for result in row] for row in results])
-  residuals = np.array(
-    [[(x.position_residual, x.rotation_residual) for x in row] for row in results]
-  )
-  return q, residuals
 
 
 def _cache_path(task: Task, rows: int) -> pathlib.Path:

@@ -91,3 +91,28 @@ class IkSolver:
       longest = max(float(np.abs(velocity).max()), 1e-9)
       configuration.integrate_inplace(velocity, min(1.0, MAX_STEP / longest))
     return IkResult(configuration.q[: len(start)].copy(), *map(float, residuals))
+
+
+def solve_all(
+  starts: np.ndarray, positions: np.ndarray, rotations: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+  """Solves the targets of many states, as the work of one process.
+
+  Args:
+    starts: f64[n, 6], rad.
+    positions: f64[n, k, 3], m.
+    rotations: f64[n, k, 3, 3].
+
+  Returns:
+    f64[n, k, 6] targets (rad) and f64[n, k, 2] residuals (m and rad).
+  """
+  solver = IkSolver()
+  results = [
+    [solver.solve(start, pos, mat) for pos, mat in zip(p, r, strict=True)]
+    for start, p, r in zip(starts, positions, rotations, strict=True)
+  ]
+  q = np.array([[result.q for result in row] for row in results])
+  residuals = np.array(
+    [[(x.position_residual, x.rotation_residual) for x in row] for row in results]
+  )
+  return q, residuals

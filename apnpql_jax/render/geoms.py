@@ -12,6 +12,8 @@ import dataclasses
 import mujoco
 import numpy as np
 
+from apnpql_jax.config import ConfigError
+
 _TYPES = mujoco.mjtGeom
 SUPPORTED = (
   _TYPES.mjGEOM_PLANE,
@@ -57,7 +59,7 @@ class Geoms:
       The static description.
 
     Raises:
-      ValueError: a visible geom has a type without closed-form intersection, or a
+      ConfigError: a visible geom has a type without closed-form intersection, or a
         texture other than a checker on a plane.
     """
     rgba = _effective_rgba(model)
@@ -116,18 +118,18 @@ class CameraSpec:
     """Reads a camera by name.
 
     Raises:
-      ValueError: the model has no such camera, it is not a plain perspective
+      ConfigError: the model has no such camera, it is not a plain perspective
         camera, or the image would be empty.
     """
     names = [model.camera(i).name for i in range(model.ncam)]
     if name not in names:
-      raise ValueError(f"no camera {name!r} in the model; it has {names}")
+      raise ConfigError(f"no camera {name!r} in the model; it has {names}")
     if height < 1 or width < 1:
-      raise ValueError(f"image of camera {name!r} is empty: {height}x{width}")
+      raise ConfigError(f"image of camera {name!r} is empty: {height}x{width}")
     i = names.index(name)
     perspective = mujoco.mjtProjection.mjPROJ_PERSPECTIVE
     if model.cam_projection[i] != perspective or model.cam_sensorsize[i].any():
-      raise ValueError(f"camera {name!r} must be perspective and set by fovy alone")
+      raise ConfigError(f"camera {name!r} must be perspective and set by fovy alone")
     return cls(name, i, height, width, float(model.cam_fovy[i]))
 
 
@@ -180,12 +182,12 @@ class Lighting:
       **settings: values of the other fields.
 
     Raises:
-      ValueError: the model does not have exactly one directional light, or the
+      ConfigError: the model does not have exactly one directional light, or the
         light is fixed to a moving body.
     """
     lights = np.flatnonzero(model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     if len(lights) != 1 or model.light_bodyid[lights[0]] != 0:
-      raise ValueError("the scene needs exactly one directional light, in the world")
+      raise ConfigError("the scene needs exactly one directional light, in the world")
     x, y, z = model.light_dir[lights[0]].tolist()
     return cls(direction=(x, y, z), **settings)
 
@@ -205,9 +207,9 @@ def _refuse_unsupported(model: mujoco.MjModel, ids: np.ndarray) -> None:
     name = model.geom(i).name or f"geom {i}"
     if kind not in SUPPORTED:
       valid = ", ".join(t.name for t in SUPPORTED)
-      raise ValueError(f"cannot draw {name!r}: {kind.name} is none of {valid}")
+      raise ConfigError(f"cannot draw {name!r}: {kind.name} is none of {valid}")
     if _texture_id(model, i) >= 0 and kind != _TYPES.mjGEOM_PLANE:
-      raise ValueError(f"cannot draw the texture of {name!r}: only planes have one")
+      raise ConfigError(f"cannot draw the texture of {name!r}: only planes have one")
 
 
 def _texture_id(model: mujoco.MjModel, geom_id: int) -> int:
@@ -234,5 +236,5 @@ def _read_checker(
   scale = np.where((size > 0) & ~model.mat_texuniform[material], size, 1.0) / repeat
   if not np.array_equal(data, expected) or scale[0] != scale[1]:
     name = model.geom(geom_id).name or f"geom {geom_id}"
-    raise ValueError(f"cannot draw the texture of {name!r}: not a square checker")
+    raise ConfigError(f"cannot draw the texture of {name!r}: not a square checker")
   return float(scale[0]), even / 255.0, odd / 255.0

@@ -13,12 +13,6 @@ from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
 
 
-def contact_budget(scene: Scene) -> dict[str, int]:
-  """Contacts and constraint rows that MJX computes per substep, touching or not."""
-  data = mjx.make_data(scene.model, impl="jax")._impl
-  return {"contacts": data.ncon, "constraint_rows": data.nefc}
-
-
 class MjxPhysics:
   """Worlds advanced by ``jax.vmap`` over MJX; see ``physics.Physics``."""
 

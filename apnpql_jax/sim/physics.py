@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax.config import BACKENDS, ConfigError
+from apnpql_jax.config import BACKENDS, check_name
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
 
@@ -77,8 +77,7 @@ def make_physics(name: str, scene: Scene, *, substeps: int) -> Physics:
   Raises:
     ConfigError: unknown name.
   """
-  if name not in BACKENDS:
-    raise ConfigError(f"unknown backend '{name}' (valid: {', '.join(BACKENDS)})")
+  check_name("backend", name, BACKENDS)
   if name == "auto":
     name = "native" if jax.default_backend() == "cpu" else "mjx"
   if name == "native":

@@ -126,7 +126,7 @@ def load_scene(
 
 
 def refuse_unsupported(model: mujoco.MjModel, name: str) -> None:
-  """Raises ConfigError where ``mjx.put_model`` accepts but does not simulate.
+  """Raises ConfigError where MJX refuses, or accepts but does not simulate.
 
   Source: the MJX-JAX engine of mujoco-mjx 3.17.0 has no code for these.
   """
@@ -153,6 +153,10 @@ def refuse_unsupported(model: mujoco.MjModel, name: str) -> None:
   names = [feature for feature, used in found.items() if used]
   if names:
     raise ConfigError(f"{name}.xml uses what is not simulated: {', '.join(names)}")
+  try:
+    mjx.put_model(model, impl="jax")
+  except NotImplementedError as error:
+    raise ConfigError(f"{name}.xml uses what MJX cannot simulate: {error}") from error
 
 
 def _named_id(model: mujoco.MjModel, scene: str, kind: str, name: str) -> int:

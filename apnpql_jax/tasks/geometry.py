@@ -40,7 +40,10 @@ def axis(quat: Array, index: int) -> Array:
 
 
 def level_heading(quat: Array) -> Array:
-  """Heading of the most level axis of a box, which may lie on any of its faces."""
+  """Heading of the most level axis of a box, which may lie on any of its faces.
+
+  f32[*b, 4] (wxyz) -> f32[*b].
+  """
   axes = jnp.stack([axis(quat, i) for i in range(3)])
   level = jnp.argmin(jnp.abs(axes[..., 2]), axis=0)
   x, y = (jnp.take_along_axis(axes[..., i], level[None], axis=0)[0] for i in range(2))
@@ -48,7 +51,10 @@ def level_heading(quat: Array) -> Array:
 
 
 def fold(angle: Array, period: float) -> Array:
-  """The equivalent angle nearest to zero of a shape that repeats every ``period``."""
+  """The equivalent angle nearest to zero of a shape that repeats every ``period``.
+
+  f32[*b] -> f32[*b].
+  """
   return angle - period * jnp.round(angle / period)
 
 
@@ -73,6 +79,7 @@ def is_at_rest(twist: Array) -> Array:
 def funnel(off: Array, *, aligned: float, wide: float) -> Array:
   """0 within ``aligned``, 1 beyond ``wide``, linear between: how far to stay up.
 
-  A step instead would be sharper than a network can see in the images.
+  f32[*b] (m) -> f32[*b]. A step instead would be sharper than a network can see in
+  the images.
   """
   return ((off - aligned) / (wide - aligned)).clip(0.0, 1.0)

@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from apnpql_jax.config import ConfigError
+from apnpql_jax.config import check_name
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.sim.scene import Scene
@@ -23,10 +23,10 @@ from apnpql_jax.types import Array
 class ResetDraw(NamedTuple):
   """Initial states as a task draws them, before they are settled."""
 
-  qpos: np.ndarray  # f32[n, nq]
-  mocap_pos: np.ndarray  # f32[n, nmocap, 3]
-  mocap_quat: np.ndarray  # f32[n, nmocap, 4]
-  variant: np.ndarray  # i32[n]: of the scene
+  qpos: np.ndarray  # f64[n, nq]
+  mocap_pos: np.ndarray  # f64[n, nmocap, 3], m
+  mocap_quat: np.ndarray  # f64[n, nmocap, 4]
+  variant: np.ndarray  # i64[n]: of the scene
 
 
 class Task(Protocol):
@@ -87,8 +87,7 @@ def make_task(name: str) -> Task:
   Raises:
     ConfigError: unknown name; the message lists the valid ones.
   """
-  if name not in task_names():
-    raise ConfigError(f"unknown task '{name}' (valid: {', '.join(task_names())})")
+  check_name("task", name, task_names())
   return _REGISTRY[name]()
 
 

@@ -1,0 +1,48 @@
+"""docs/add_a_task.md is followed to the letter, in a copy of the project."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+import re
+import shutil
+import subprocess
+import sys
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def blocks() -> dict[str, str]:
+  """File name -> content, from headings that name a file and the block after them."""
+  text = (ROOT / "docs" / "add_a_task.md").read_text()
+  found = re.findall(r"^## .*`(\S+)`$.*?^```\w+\n(.*?)^```$", text, re.M | re.S)
+  return dict(found)
+
+
+def test_the_task_of_the_guide_runs(tmp_path: Path):
+  for folder in ("apnpql_jax", "mjcf", "experiments"):
+    skip = shutil.ignore_patterns("__pycache__", "results")
+    shutil.copytree(ROOT / folder, tmp_path / folder, ignore=skip)
+  files = blocks()
+  assert [Path(name).parent.name for name in files] == ["mjcf", "tasks", "experiments"]
+  for name, content in files.items():
+    assert not (tmp_path / name).exists()
+    (tmp_path / name).write_text(content)
+
+  def apnpql(*args: str) -> dict:
+    command = [sys.executable, "-m", "apnpql_jax", *args, "--json"]
+    done = subprocess.run(
+      command,
+      cwd=tmp_path,
+      env=dict(os.environ, PYTHONPATH=str(tmp_path)),
+      capture_output=True,
+      text=True,
+      check=True,
+    )
+    return json.loads(done.stdout)
+
+  names = apnpql("list")
+  assert "touch_ball" in names["tasks"] and "touch_ball" in names["presets"]
+  figures = apnpql("collect", "touch_ball", "--episodes", "32")
+  assert figures["successes"] >= 31 and figures["mean_length"] < 30
