@@ -175,7 +175,7 @@ def test_a_held_cup_is_lifted_and_turned_on(task, resets, kinematics_of, flip):
   cup[:, 2] = 0.25
   flat = cup * [1, 1, 0]
   reach = flat / np.linalg.norm(flat, axis=-1, keepdims=True)
-  heading = Rotation.from_euler("z", np.arctan2(reach[:, 1], reach[:, 0]))
+  heading = Rotation.from_euler("z", np.arctan2(reach[:, 1:2], reach[:, :1]))
   state = gripping(task, put(task, resets, cup, heading * UPSIDE_DOWN))
   turned = Rotation.from_rotvec(flip * reach) * heading * UPSIDE_DOWN
   state = put(task, state, cup, turned)
