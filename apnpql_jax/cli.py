@@ -93,7 +93,7 @@ def train(args: Train, argv: Sequence[str]) -> Json:
 
 
 def evaluate(args: Evaluate, argv: Sequence[str]) -> Json:
-  """Plays held-out episodes with the newest checkpoint of a run."""
+  """Plays held-out episodes with a checkpoint of a run."""
   del argv
   if not args.run:
     raise ConfigError("evaluate needs a run folder: apnpql evaluate RUN")
@@ -105,7 +105,11 @@ def evaluate(args: Evaluate, argv: Sequence[str]) -> Json:
   from apnpql_jax.evaluate import evaluate_run
 
   return evaluate_run(
-    Path(args.run), episodes=args.episodes, seed=args.seed, backend=args.backend
+    Path(args.run),
+    episodes=args.episodes,
+    seed=args.seed,
+    backend=args.backend,
+    step=_checkpoint_step(args),
   )
 
 
@@ -168,6 +172,21 @@ def _check_registered(config: TrainConfig) -> None:
     tasks=tasks.task_names(),
     algorithms=tuple(algorithms.ALGORITHMS),
     memory_bytes=memory.available_memory(),
+  )
+
+
+def _checkpoint_step(args: Evaluate) -> int | None:
+  """Steps of the checkpoint asked for; None for the newest."""
+  if args.checkpoint == "newest":
+    return None
+  if args.checkpoint == "best":
+    from apnpql_jax.checkpoint import best_step
+
+    return best_step(Path(args.run))
+  if args.checkpoint.isdigit():
+    return int(args.checkpoint)
+  raise ConfigError(
+    f"unknown --checkpoint {args.checkpoint!r}; choose from newest, best, or its steps"
   )
 
 

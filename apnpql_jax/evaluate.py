@@ -98,22 +98,28 @@ def play_held_out(
 
 
 def evaluate_run(
-  run_dir: Path, *, episodes: int, seed: int, backend: str | None = None
+  run_dir: Path,
+  *,
+  episodes: int,
+  seed: int,
+  backend: str | None = None,
+  step: int | None = None,
 ) -> dict[str, Any]:
-  """Plays held-out episodes with the newest checkpoint of a run.
+  """Plays held-out episodes with a checkpoint of a run.
 
   Args:
     run_dir: the run folder.
     episodes: how many.
     seed: of rows and actions.
     backend: physics engine; the run's own if None.
+    step: of the checkpoint; the newest if None.
 
   Raises:
     ConfigError: not a run folder, or no readable checkpoint.
   """
   began = time.monotonic()
   config = run_folder.open_run(run_dir).config
-  step = checkpoint.check(run_dir, None, config=config)
+  step = checkpoint.check(run_dir, step, config=config)
   env_config = dataclasses.replace(config.env, backend=backend or config.env.backend)
   env, agent = make_env(env_config), make_agent(config.agent)
   example = jax.eval_shape(lambda: initial_state(config, env, agent))

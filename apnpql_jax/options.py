@@ -62,7 +62,11 @@ class Evaluate:
   """Plays held-out episodes with a trained agent: apnpql evaluate RUN [options]."""
 
   run: tyro.conf.Positional[str] = ""
-  """Run folder; its newest checkpoint is played."""
+  """Run folder."""
+
+  checkpoint: str = "newest"
+  """Which one to play: newest, best (of highest success rate while training), or its
+  number of steps."""
 
   episodes: int = 200
   """Episodes to play."""

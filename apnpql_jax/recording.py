@@ -9,13 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from apnpql_jax.env import GLOBAL_SIZE, WRIST_SIZE, Env, EnvState, camera_renderer
-from apnpql_jax.render.video import tile, write_video
+from apnpql_jax.render.video import GREEN, RED, add_border, tile, write_video
 from apnpql_jax.rollout import Policy
 from apnpql_jax.types import Array
 
 EPISODES = 4
 VIEW_SIZE = (216, 288)
 """Height and width of the larger view, three times the global camera's."""
+
+HOLD = 4
+"""Frames for which the last instant of an episode stays, framed in green or red."""
 
 
 def record_episodes(env: Env, policy: Policy, path: Path) -> None:
@@ -34,7 +37,8 @@ def record_episodes(env: Env, policy: Policy, path: Path) -> None:
 def film(
   env: Env, policy: Policy, *, view_size: tuple[int, int] = VIEW_SIZE
 ) -> list[np.ndarray]:
-  """Plays held-out episodes; u8[T, H, W, 3] each, from the first to the last instant.
+  """Plays held-out episodes; u8[T, H, W, 3] each, from the first to the last instant,
+  which is framed in green if the task was solved and in red if not.
 
   Args:
     env: the worlds.
@@ -42,7 +46,7 @@ def film(
     view_size: height and width of the larger view, pixels.
   """
   rows = env.bank_split + jnp.arange(EPISODES)
-  states, running = jax.jit(lambda key: _play(env, policy, rows, key))(
+  states, running, solved = jax.jit(lambda key: _play(env, policy, rows, key))(
     jax.random.key(0)
   )
   cameras = (
@@ -55,19 +59,28 @@ def film(
   for episode in range(EPISODES):
     steps = int(running[:, episode].sum())
     physics = jax.tree.map(lambda x: x[:, episode], states)  # noqa: B023
-    episodes.append(tile([np.asarray(view)[: steps + 1] for view in draw(physics)]))
+    frames = tile([np.asarray(view)[: steps + 1] for view in draw(physics)])
+    color = GREEN if solved[:, episode].any() else RED
+    last = add_border(frames[-1:], color).repeat(HOLD, axis=0)
+    episodes.append(np.concatenate([frames[:-1], last]))
   return episodes
 
 
-def _play(env: Env, policy: Policy, rows: Array, key: Array) -> tuple[EnvState, Array]:
-  """Physics states [time, episodes, ...] and which episodes were still running."""
+def _play(
+  env: Env, policy: Policy, rows: Array, key: Array
+) -> tuple[EnvState, Array, Array]:
+  """Physics states, which episodes were still running, which were solved just now.
+
+  All with leading axes [time, episodes].
+  """
 
   def period(carry, key):
     state, running = carry
     policy_key, env_key = jax.random.split(key)
     moved = env.step(state, policy(state, policy_key), env_key)
     running = running & ~state.timestep.last
-    return (moved, running), (state.physics, running)
+    solved = running & moved.timestep.terminated
+    return (moved, running), (state.physics, running, solved)
 
   start = (env.reset(rows), jnp.ones(EPISODES, bool))
   keys = jax.random.split(key, env.config.episode_steps + 1)

@@ -61,6 +61,8 @@ def train(
   memory.check_memory(_nbytes(example), "the training state")
   if resume:
     folder = run_folder.open_run(run_dir)
+    for change in run_folder.changed_versions(folder):
+      _say(f"not as when the run began: {change}")
     state = checkpoint.restore(run_dir, None, example, config=config)
   else:
     _say("collecting the expert's replay")

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import os
 from pathlib import Path
+import re
 import subprocess
 import sys
 
@@ -84,6 +85,8 @@ BAD_INPUT = [
   ("evaluate runs", ["not a run folder", "runs/old"]),
   ("evaluate runs/old --episodes 0", ["--episodes"]),
   ("evaluate runs/old --seed -1", ["--seed"]),
+  ("evaluate runs/old --checkpoint last", ["'last'", "newest", "best"]),
+  ("evaluate runs/old", ["no checkpoint"]),
   ("evaluate runs/old --backend bullet", ["'bullet'", *BACKENDS]),
   ("evaluate runs/broken", ["config.json", "'env'", "missing"]),
   ("collect", ["push_plate"]),
@@ -147,6 +150,14 @@ def test_help_names_every_command_and_every_setting(tmp_path):
     for field in dataclasses.fields(part):
       if not dataclasses.is_dataclass(getattr(part, field.name)):
         assert f"--{prefix}{field.name.replace('_', '-')}" in done.stdout
+
+
+def test_help_of_a_preset_shows_its_settings(tmp_path):
+  done = apnpql("train", "push_plate", "--help", cwd=tmp_path)
+  shown = re.sub(r"[\s│]+", " ", done.stdout)
+  preset = presets.load_preset("push_plate")
+  assert preset.total_steps != TrainConfig().total_steps
+  assert f"(default: {preset.total_steps})" in shown
 
 
 def test_help_imports_neither_jax_nor_mujoco(tmp_path):

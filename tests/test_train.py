@@ -109,7 +109,9 @@ def test_ctrl_c_ends_the_run_with_a_checkpoint(tmp_path):
   command += "--replay.capacity 512 --replay.expert-steps 128".split()
   command += "--total-steps 1000000 --eval-every 1000000".split()
   command += "--checkpoint-every 1000000".split()
-  process = subprocess.Popen([*command, "--run", str(run_dir)])
+  said = tmp_path / "said.txt"
+  with said.open("w") as file:
+    process = subprocess.Popen([*command, "--run", str(run_dir)], stderr=file)
   try:
     metrics = run_dir / "metrics.jsonl"
     deadline = time.monotonic() + 300
@@ -123,6 +125,7 @@ def test_ctrl_c_ends_the_run_with_a_checkpoint(tmp_path):
   (step,) = checkpoint.all_steps(run_dir)
   rows = [json.loads(line) for line in metrics.read_text().splitlines()]
   assert rows[-1]["step"] == step
+  assert f"saved at step {step}; to go on: --resume {run_dir}" in said.read_text()
 
 
 def test_signals_are_collected_once_and_given_back():
