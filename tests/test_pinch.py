@@ -102,7 +102,14 @@ def pinch(scene) -> Pinch:
   mujoco.mj_resetDataKeyframe(scene.model, data, scene.id("key", "neutral"))
   mujoco.mj_kinematics(scene.model, data)
   mat = data.site("tool").xmat.reshape(3, 3)
-  return Pinch(scene, jnp.asarray(mat, jnp.float32), width=WIDTH, above=ABOVE)
+  return Pinch(
+    scene,
+    jnp.asarray(mat, jnp.float32),
+    width=WIDTH,
+    above=ABOVE,
+    hover=0.07,
+    travel=0.14,
+  )
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.tasks import make_task, place_plate, task_names
-from apnpql_jax.tasks.pinch import finger_angle, pinch_height
+from apnpql_jax.tasks.pinch import ALIGNED, FUNNEL, finger_angle, pinch_height
 
 WORLDS = 16
 OPEN = 0.1
@@ -377,7 +377,7 @@ def edge(task, state):
   )
 
 
-FUNNEL_WIDTH = place_plate.FUNNEL - place_plate.ALIGNED
+FUNNEL_WIDTH = FUNNEL - ALIGNED
 
 
 @pytest.mark.parametrize(

@@ -54,12 +54,6 @@ MASS = 0.025
 STANDOFF = 0.09
 """m; behind the cup by this much the open fingers are clear of it."""
 
-ALIGNED, FUNNEL = 0.012, 0.05
-"""m; the tool goes in fully within the first, stays out beyond the second."""
-
-LEVER = 0.05
-"""m/rad; how much an angle of the hand counts as being off."""
-
 LIFT = 0.07
 """m; how high the cup is carried: a cup and fingers that turn reach down 100 mm."""
 
@@ -151,8 +145,8 @@ class FlipCup(TableTask):
     missing = tool - grasp
     along = (missing * reach).sum(-1, keepdims=True)
     off = geometry.norm(missing - along * reach)
-    off = off + LEVER * self._turned_away(kinematics, reach, roll)
-    back = geometry.funnel(off, aligned=ALIGNED, wide=FUNNEL)
+    off = off + pinch.LEVER * self._turned_away(kinematics, reach, roll)
+    back = geometry.funnel(off, aligned=pinch.ALIGNED, wide=pinch.FUNNEL)
     stay = held | self._around(state, kinematics)
     may_enter = stay | self._is_open(state)
     back = STANDOFF * jnp.where(may_enter, back, 1.0)[:, None]
@@ -160,8 +154,8 @@ class FlipCup(TableTask):
 
     outward = _direction(goal)
     shift = goal[:, :2] - cup[:, :2]
-    far = geometry.norm(shift) + LEVER * (np.pi - flip)
-    far = geometry.funnel(far, aligned=ALIGNED, wide=FUNNEL)
+    far = geometry.norm(shift) + pinch.LEVER * (np.pi - flip)
+    far = geometry.funnel(far, aligned=pinch.ALIGNED, wide=pinch.FUNNEL)
     lifted = cup[:, 2] - middle
     free = ((lifted - 0.01) / (FREE - 0.01)).clip(0.0, 1.0)
     free = jnp.maximum(free, 1.0 - far)  # Close to its place it may be low.

@@ -26,20 +26,39 @@ STRAIGHT = 0.1
 """rad; the hand may close when it is turned away by less."""
 
 
+ALIGNED, FUNNEL = 0.012, 0.05
+"""m; the tool goes in fully within the first, stays out beyond the second."""
+
+LEVER = 0.05
+"""m/rad; how much a twist of the fingers counts as being off."""
+
+
 class Pinch:
   """A grip between the pads on something of known width, by a vertical tool.
 
   All methods are batched over worlds.
   """
 
-  def __init__(self, scene: Scene, neutral_mat: Array, *, width: float, above: float):
+  def __init__(
+    self,
+    scene: Scene,
+    neutral_mat: Array,
+    *,
+    width: float,
+    above: float,
+    hover: float,
+    travel: float,
+  ):
     """
     Args:
       scene: gives the tool site and the finger.
       neutral_mat: f32[3, 3], the tool's rotation at heading zero.
       width: m, of what is gripped.
       above: m, distance along the tool from where it is aimed at to the pads' centre.
+      hover: m, height over the grasp at which the open finger tips clear the object.
+      travel: m, tool height at which closed fingers clear everything.
     """
+    self._hover, self._travel = hover, travel
     self._scene, self._neutral_mat, self._width = scene, neutral_mat, width
     self.depth = float(pinch_height(width)) - above
     """m from the tool site back to the point that is aimed at what is gripped."""
@@ -63,6 +82,42 @@ class Pinch:
     """bool[worlds]: the pads grip something of this width, at ``point`` (m)."""
     gripping = is_gripping(self._scene, state, self._width)
     return gripping & (geometry.norm(self.point(kinematics) - point) < LOST)
+
+  def approach(
+    self, state: PhysicsState, kinematics: Kinematics, aim: Array, twist: Array
+  ) -> Array:
+    """Tool position that leads around ``aim`` without knocking it over.
+
+    A low tool rises first; over the object it descends through a funnel, but not with
+    fingers that are closed on nothing; around the object it stays.
+
+    Args:
+      state: [worlds, ...].
+      kinematics: [worlds, ...].
+      aim: f32[worlds, 3], m.
+      twist: f32[worlds], rad.
+
+    Returns:
+      f32[worlds, 3], m.
+    """
+    tool = kinematics.site_xpos[:, self._scene.tool_site]
+    off = geometry.norm(tool[:, :2] - aim[:, :2]) + LEVER * jnp.abs(twist)
+    height = geometry.funnel(off, aligned=ALIGNED, wide=FUNNEL)
+    at_it = self.holds(state, kinematics, aim) | self.around(kinematics, aim, twist)
+    height = self._hover * jnp.where(at_it | self.is_open(state), height, 1.0)
+    down = geometry.up(aim[:, :2], aim[:, 2] - self.depth + height)
+    return self._rise_first(tool, aim, down)
+
+  def above(self, kinematics: Kinematics, place: Array) -> Array:
+    """Tool position f32[worlds, 3] (m) high over a place; a low tool rises first."""
+    tool = kinematics.site_xpos[:, self._scene.tool_site]
+    return self._rise_first(tool, place, geometry.up(place[:, :2], self._travel))
+
+  def _rise_first(self, tool: Array, place: Array, target: Array) -> Array:
+    low = tool[:, 2] < self._travel - 0.02
+    away = geometry.norm(tool[:, :2] - place[:, :2]) > FUNNEL
+    rise = geometry.up(tool[:, :2], self._travel)
+    return jnp.where((low & away)[:, None], rise, target)
 
   def around(self, kinematics: Kinematics, point: Array, twist: Array) -> Array:
     """bool[worlds]: where the hand may close to grip ``point`` (m)."""

@@ -22,7 +22,7 @@ import numpy as np
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.tasks import geometry
-from apnpql_jax.tasks.pinch import Pinch, pick_and_place
+from apnpql_jax.tasks.pinch import ALIGNED, FUNNEL, Pinch, pick_and_place
 from apnpql_jax.tasks.table import TableTask
 from apnpql_jax.tasks.task import ResetDraw, register
 from apnpql_jax.types import Array
@@ -44,12 +44,6 @@ RADIUS = 0.0647
 
 GRASP_INSET = 0.013
 """m from the plate's edge to the pads' centre: the pads are 20 mm long."""
-
-ALIGNED, FUNNEL = 0.012, 0.05
-"""m; the tool descends fully within the first, stays up beyond the second."""
-
-LEVER = 0.05
-"""m/rad; how much a twist of the fingers counts as being off."""
 
 HOVER = 0.06
 """m; height over the grasp at which the open finger tips clear the plate."""
@@ -84,7 +78,14 @@ class PlacePlate(TableTask):
     super().__init__()
     self._plate, self._plate_dof = self.scene.free_joint("plate")
     self._goal, self._holder = self.scene.mocap("goal"), self.scene.mocap("holder")
-    self._hand = Pinch(self.scene, self._neutral_mat, width=THICKNESS, above=0.0)
+    self._hand = Pinch(
+      self.scene,
+      self._neutral_mat,
+      width=THICKNESS,
+      above=0.0,
+      hover=HOVER,
+      travel=TRAVEL,
+    )
 
   def sample_resets(self, rng: np.random.Generator, count: int) -> ResetDraw:
     """See ``Task.sample_resets``."""
@@ -117,17 +118,7 @@ class PlacePlate(TableTask):
     edge = self._edge(state)
     twist = self._hand.twist(kinematics, self._plate_yaw(state), np.pi)
     held = self._hand.holds(state, kinematics, edge)
-    stay = held | self._hand.around(kinematics, edge, twist)
-    rise = geometry.up(tool[:, :2], TRAVEL)
-    low = tool[:, 2] < TRAVEL - 0.02
-
-    off = geometry.norm(tool[:, :2] - edge[:, :2])
-    leave = ((off > FUNNEL) & low)[:, None]
-    off = off + LEVER * jnp.abs(twist)
-    height = geometry.funnel(off, aligned=ALIGNED, wide=FUNNEL)
-    height = HOVER * jnp.where(stay | self._hand.is_open(state), height, 1.0)
-    grasp = geometry.up(edge[:, :2], edge[:, 2] - self._hand.depth + height)
-    to_object = jnp.where(leave, rise, grasp)
+    to_object = self._hand.approach(state, kinematics, edge, twist)
 
     shift = goal - plate
     far = geometry.funnel(geometry.norm(shift[:, :2]), aligned=ALIGNED / 2, wide=FUNNEL)
@@ -135,9 +126,7 @@ class PlacePlate(TableTask):
     free = ((plate[:, 2] - RADIUS - 0.005) / (FREE - 0.005)).clip(0.0, 1.0)
     free = jnp.maximum(free, 1.0 - far)  # Close to its place it may be low.
     carry = tool + geometry.up(free[:, None] * shift[:, :2], climb)
-    leave = ((geometry.norm(tool[:, :2] - goal[:, :2]) > FUNNEL) & low)[:, None]
-    empty = jnp.where(leave, rise, geometry.up(goal[:, :2], TRAVEL))
-    to_goal = jnp.where(held[:, None], carry, empty)
+    to_goal = jnp.where(held[:, None], carry, self._hand.above(kinematics, goal))
 
     positions = self.with_neutral(to_object, to_goal)
     box_yaw = geometry.yaw(state.mocap_quat[:, self._goal])

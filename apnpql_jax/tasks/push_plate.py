@@ -102,11 +102,14 @@ class PushPlate(TableTask):
     plate, goal = self._plate_xy(state), self._goal_xy(state)
     inside = self._inside(tool, plate)[:, None]
     above = (tool[:, 2] > CLEAR)[:, None]
-    off = (geometry.norm(tool[:, :2] - plate) - ALIGNED) / (FUNNEL - ALIGNED)
-    funnel = DRAG_HEIGHT + (HOVER_HEIGHT - DRAG_HEIGHT) * off.clip(0.0, 1.0)
+    off = geometry.norm(tool[:, :2] - plate)
+    stay_up = geometry.funnel(off, aligned=ALIGNED, wide=FUNNEL)
+    funnel = DRAG_HEIGHT + (HOVER_HEIGHT - DRAG_HEIGHT) * stay_up
 
     rise = geometry.up(tool[:, :2], HOVER_HEIGHT)
-    onto_plate = jnp.where(above | (off < 1)[:, None], geometry.up(plate, funnel), rise)
+    onto_plate = jnp.where(
+      above | (stay_up < 1)[:, None], geometry.up(plate, funnel), rise
+    )
     to_object = jnp.where(inside, geometry.up(plate, DRAG_HEIGHT), onto_plate)
     # Full speed from halfway down: the tip's height is what a policy knows least.
     depth = (2 * (LOW - tool[:, 2]) / (LOW - DRAG_HEIGHT)).clip(0.0, 1.0)

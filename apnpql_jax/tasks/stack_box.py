@@ -20,7 +20,7 @@ import numpy as np
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.tasks import geometry
-from apnpql_jax.tasks.pinch import Pinch, pick_and_place
+from apnpql_jax.tasks.pinch import ALIGNED, FUNNEL, Pinch, pick_and_place
 from apnpql_jax.tasks.table import TableTask
 from apnpql_jax.tasks.task import ResetDraw, register
 from apnpql_jax.types import Array
@@ -36,12 +36,6 @@ MIN_DISTANCE = 0.13
 
 SIDE = 0.05
 """m; edge of a box."""
-
-ALIGNED, FUNNEL = 0.012, 0.05
-"""m; the tool descends fully within the first, stays up beyond the second."""
-
-LEVER = 0.05
-"""m/rad; how much a twist of the fingers counts as being off."""
 
 HOVER = 0.07
 """m; height over the grasp at which the open finger tips clear the box."""
@@ -73,7 +67,14 @@ class StackBox(TableTask):
     self._yellow, self._yellow_dof = self.scene.free_joint("yellow")
     self._blue, self._blue_dof = self.scene.free_joint("blue")
     # Four millimetres above the centre, for room between fingers and table.
-    self._hand = Pinch(self.scene, self._neutral_mat, width=SIDE, above=0.004)
+    self._hand = Pinch(
+      self.scene,
+      self._neutral_mat,
+      width=SIDE,
+      above=0.004,
+      hover=HOVER,
+      travel=TRAVEL,
+    )
 
   def sample_resets(self, rng: np.random.Generator, count: int) -> ResetDraw:
     """See ``Task.sample_resets``."""
@@ -93,32 +94,19 @@ class StackBox(TableTask):
     self, state: PhysicsState, kinematics: Kinematics
   ) -> tuple[Array, Array]:
     """See ``Task.tool_targets``."""
-    tool = kinematics.site_xpos[:, self.scene.tool_site]
     yellow, blue = self._yellow_pos(state), self._blue_pos(state)
     yellow_yaw, blue_yaw = self._yaw(state, self._yellow), self._yaw(state, self._blue)
     twist = self._hand.twist(kinematics, yellow_yaw, np.pi / 2)
-    held = self._hand.holds(state, kinematics, yellow)
-    stay = held | self._hand.around(kinematics, yellow, twist)
-    rise = geometry.up(tool[:, :2], TRAVEL)
-    low = (tool[:, 2] < TRAVEL - 0.03)[:, None]
-
-    off = geometry.norm(tool[:, :2] - yellow[:, :2])
-    leave = (off > FUNNEL)[:, None] & low
-    off = off + LEVER * jnp.abs(twist)
-    height = geometry.funnel(off, aligned=ALIGNED, wide=FUNNEL)
-    height = HOVER * jnp.where(stay | self._hand.is_open(state), height, 1.0)
-    grasp = geometry.up(yellow[:, :2], yellow[:, 2] - self._hand.depth + height)
-    to_object = jnp.where(leave, rise, grasp)
+    to_object = self._hand.approach(state, kinematics, yellow, twist)
 
     shift = blue - yellow
     over = geometry.funnel(
       geometry.norm(shift[:, :2]), aligned=ALIGNED / 2, wide=FUNNEL
     )
+    tool = kinematics.site_xpos[:, self.scene.tool_site]
     onto = tool + shift + geometry.up(0 * shift[:, :2], SIDE + 0.001 + LIFT * over)
-    above = geometry.up(blue[:, :2], TRAVEL)
-    off_blue = geometry.norm(tool[:, :2] - blue[:, :2])
-    empty = jnp.where((off_blue > FUNNEL)[:, None] & low, rise, above)
-    to_goal = jnp.where(held[:, None], onto, empty)
+    held = self._hand.holds(state, kinematics, yellow)[:, None]
+    to_goal = jnp.where(held, onto, self._hand.above(kinematics, blue))
 
     positions = self.with_neutral(to_object, to_goal)
     turns = jnp.stack([yellow_yaw, blue_yaw, 0 * blue_yaw], 1)
