@@ -84,7 +84,7 @@ class AgentConfig:
   """Candidate actions per state in the value target."""
 
   policy_samples: int = 100
-  """Candidate actions per state when acting and in the alpha, M and nu updates."""
+  """Candidate actions per state when acting and in the alpha and M updates."""
 
   hidden: tuple[int, ...] = (256, 256)
   """Widths of the hidden layers of each head."""
