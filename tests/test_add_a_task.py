@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 def blocks() -> dict[str, str]:
   """File name -> content, from headings that name a file and the block after them."""
   text = (ROOT / "docs" / "add_a_task.md").read_text()
-  found = re.findall(r"^## .*`(\S+)`$.*?^```\w+\n(.*?)^```$", text, re.M | re.S)
+  found = re.findall(r"^## [^\n]*`(\S+)`$.*?^```\w+\n(.*?)^```$", text, re.M | re.S)
   return dict(found)
 
 

@@ -139,7 +139,7 @@ def test_kinematics_agree_with_mujoco(task, resets):
 
 
 def test_unknown_backend_is_refused(task):
-  with pytest.raises(ConfigError, match="valid: auto, mjx, native"):
+  with pytest.raises(ConfigError, match="choose from auto, mjx, native"):
     physics.make_physics("bullet", task.scene, substeps=30)
 
 

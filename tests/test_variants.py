@@ -44,7 +44,7 @@ def state(task) -> physics.PhysicsState:
   draw.qpos[:, address + 2] = heights + np.repeat([0.2, 0.002], 3)
   draw = draw._replace(variant=variant)
   state = physics.initial_state(task.scene, *map(jnp.asarray, draw))
-  return state.replace(qvel=state.qvel.at[:3, dof + 3 : dof + 6].set([8.0, 0.0, 8.0]))
+  return state.replace(qvel=state.qvel.at[:3, dof + 3 : dof + 6].set([2.0, 0.0, 2.0]))
 
 
 @pytest.fixture(scope="module", params=["native", "mjx"])
@@ -58,16 +58,19 @@ def moved(request, task, state) -> np.ndarray:
 
 def test_each_cup_spins_with_its_own_inertia(task, models, state, moved):
   address, _ = task.scene.free_joint("cup")
-  poses = []
-  for world, model in enumerate(models):
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = state.qpos[world], state.qvel[world]
-    for _ in range(30):
-      mujoco.mj_step(model, data)
-    poses.append(data.qpos[address : address + 7].copy())
-  np.testing.assert_allclose(moved[:3, 2:], np.array(poses)[:, 2:], atol=2e-4)
-  # The shapes turn differently, so a shared model could not pass.
-  assert np.abs(np.diff(np.array(poses)[:, 3:], axis=0)).max(1).min() > 5e-3
+  for world in range(len(models)):
+    errors = []
+    for model in models:
+      data = mujoco.MjData(model)
+      data.qpos[:], data.qvel[:] = state.qpos[world], state.qvel[world]
+      for _ in range(30):
+        mujoco.mj_step(model, data)
+      error = moved[world, 2:] - data.qpos[address + 2 : address + 7]
+      errors.append(np.abs(error).max())
+    # The engines integrate gyroscopic torques differently, by much less than the
+    # shapes differ.
+    assert errors[world] < 2e-4
+    assert min(np.delete(errors, world)) > 4e-4
 
 
 def test_each_cup_stands_on_its_own_height(moved):
