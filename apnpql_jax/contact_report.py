@@ -40,7 +40,7 @@ def contact_report(
   report = {
     "pairs": scene.model.npair,
     "contacts": slots.ncon,
-    "constraint_rows": slots.nefc,
+    "constraint_rows": int(slots.nefc),
   }
   draw = task.sample_resets(np.random.default_rng(0), WORLDS)
   start = physics.initial_state(scene, *map(jnp.asarray, draw))

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from flax import struct
 import jax
 from mujoco import mjx
-from mujoco.mjx._src import scan as _mjx_scan
 
+from apnpql_jax.sim.mjx_patches import patch_mjx
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
@@ -28,7 +28,7 @@ class Kinematics(struct.PyTreeNode):
 
 def make_kinematics(scene: Scene) -> Callable[[PhysicsState], Kinematics]:
   """Returns ``f(state) -> Kinematics`` over [worlds, ...], one path for all engines."""
-  guard_body_tree()
+  patch_mjx()
   model = mjx.put_model(scene.model, impl="jax")
   template = mjx.make_data(scene.model, impl="jax")
 
@@ -50,25 +50,3 @@ def make_kinematics(scene: Scene) -> Callable[[PhysicsState], Kinematics]:
     return jax.vmap(single)(state.qpos, state.mocap_pos, state.mocap_quat, state.fields)
 
   return kinematics
-
-
-def guard_body_tree() -> None:
-  """Keeps XLA:CPU from recomputing the kinematic chain exponentially.
-
-  Fusion duplicates the work of a parent body into each child; on a chain of
-  eight bodies stock MJX is three orders of magnitude slower under vmap. An
-  optimisation barrier behind every body ends it. Only the CPU needs it, and the
-  wrapped function is private to mujoco-mjx, hence the narrow patch.
-  """
-  if jax.default_backend() == "cpu":
-    _mjx_scan.body_tree = _guarded_body_tree
-
-
-def _guarded_body_tree(m, f, in_types, out_types, *args, reverse=False):
-  def behind_barrier(*inputs):
-    return jax.lax.optimization_barrier(f(*inputs))
-
-  return _body_tree(m, behind_barrier, in_types, out_types, *args, reverse=reverse)
-
-
-_body_tree = _mjx_scan.body_tree

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from mujoco import mjx
 
 from apnpql_jax.sim import physics
-from apnpql_jax.sim.kinematics import guard_body_tree
+from apnpql_jax.sim.mjx_patches import patch_mjx
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
@@ -24,7 +24,7 @@ class MjxPhysics:
       scene: the scene all worlds share.
       substeps: physics steps per control period.
     """
-    guard_body_tree()
+    patch_mjx()
     self.scene = scene
     self._substeps = substeps
     self._model = mjx.put_model(scene.model, impl="jax")

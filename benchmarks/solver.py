@@ -1,0 +1,78 @@
+"""How few solver iterations the tasks can bear: the sweep behind mjcf/robot.xml.
+
+  python benchmarks/solver.py --episodes 64           # half an hour on two cores
+  python benchmarks/solver.py --tasks flip_cup --settings 20x20 10x10
+
+A setting is ITERATIONSxLS_ITERATIONS. For each, the scripted expert plays held-out
+episodes on one engine, and the scene's speed is measured. Writes results/solver.json
+beside this file and prints the table.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import apnpql_jax  # noqa: F401  isort: skip  (before JAX: sets threads and cache)
+
+from apnpql_jax.config import EnvConfig
+from apnpql_jax.contact_report import contact_report
+from apnpql_jax.env import Env
+from apnpql_jax.evaluate import make_player, play_held_out
+from apnpql_jax.primitives.bank import load_bank
+from apnpql_jax.rollout import expert_policy
+from apnpql_jax.tasks import make_task, task_names
+
+RESULT = Path(__file__).resolve().parent / "results" / "solver.json"
+
+
+def main() -> None:
+  """Command line; see the module's docstring."""
+  parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+  parser.add_argument("--tasks", nargs="+", choices=task_names(), default=task_names())
+  parser.add_argument("--backend", choices=["native", "mjx"], default="mjx")
+  parser.add_argument(
+    "--settings", nargs="+", default=["20x20", "10x10", "6x8", "4x6", "3x4"]
+  )
+  parser.add_argument("--episodes", type=int, default=64)
+  args = parser.parse_args()
+  measured = []
+  for task in args.tasks:
+    for setting in args.settings:
+      iterations, ls_iterations = map(int, setting.split("x"))
+      figures = {
+        "task": task,
+        "backend": args.backend,
+        "iterations": iterations,
+        "ls_iterations": ls_iterations,
+        **measure(task, args.backend, iterations, ls_iterations, args.episodes),
+      }
+      print(json.dumps(figures), flush=True)
+      measured.append(figures)
+      RESULT.write_text(json.dumps(measured, indent=2) + "\n")
+
+
+def measure(
+  name: str, backend: str, iterations: int, ls_iterations: int, episodes: int
+) -> dict[str, float]:
+  """The expert's successes and the physics steps per second under one setting."""
+  task = make_task(name)
+  config = EnvConfig(task=name, backend=backend, obs="state")
+  bank, _ = load_bank(task, config.bank_rows)  # As shipped: the same resets for all.
+  task.scene.model.opt.iterations = iterations
+  task.scene.model.opt.ls_iterations = ls_iterations
+  env = Env(config, task, bank)
+  play = make_player(env, lambda _: expert_policy(env, noise=0.0))
+  figures = play_held_out(env, play, None, episodes=episodes, seed=0)
+  report = contact_report(task, backends=(backend,))
+  return {
+    "episodes": episodes,
+    "successes": figures["successes"],
+    "mean_length": figures["mean_length"],
+    "steps_per_s": report[f"{backend}_steps_per_s"],
+  }
+
+
+if __name__ == "__main__":
+  main()
