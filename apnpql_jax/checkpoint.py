@@ -192,7 +192,7 @@ def restore(
   meta = _read_meta(run_dir, step)
   _check_leaves(name, meta["leaves"], leaves.describe(example_state))
   state = _read(name, _folder(run_dir), step, leaves.abstract(example_state))
-  return leaves.to_typed(state, meta["key_impls"])
+  return leaves.to_typed(state, meta["key_impls"], example_state)
 
 
 class _KeepNewestAndBest:

@@ -27,18 +27,23 @@ def key_impls(tree: Any) -> dict[str, str]:
 
 
 def to_plain(tree: Any) -> Any:
-  """The tree with the data of typed keys (u32) in their place."""
-  return jax.tree.map(_key_data, tree)
+  """The tree with the data of typed keys (u32) in their place.
+
+  Arrays without elements, which Orbax refuses, become None.
+  """
+  return jax.tree.map(lambda leaf: _key_data(leaf) if leaf.size else None, tree)
 
 
-def to_typed(tree: Any, impls: Mapping[str, str]) -> Any:
-  """Undoes ``to_plain``, given the ``key_impls`` of the original tree."""
+def to_typed(tree: Any, impls: Mapping[str, str], example: Any) -> Any:
+  """Undoes ``to_plain``, given the ``key_impls`` and shapes of the original tree."""
 
-  def wrap(path: Any, leaf: jax.Array) -> jax.Array:
+  def restored(path: Any, like: Any, leaf: jax.Array | None) -> jax.Array:
+    if leaf is None:
+      return jnp.zeros(like.shape, like.dtype)
     impl = impls.get(_name(path))
     return leaf if impl is None else jax.random.wrap_key_data(leaf, impl=impl)
 
-  return jax.tree_util.tree_map_with_path(wrap, tree)
+  return jax.tree_util.tree_map_with_path(restored, example, tree)
 
 
 def abstract(tree: Any) -> Any:
@@ -48,7 +53,9 @@ def abstract(tree: Any) -> Any:
   """
   default = jax.sharding.SingleDeviceSharding(jax.devices()[0])
 
-  def struct(leaf: Any) -> jax.ShapeDtypeStruct:
+  def struct(leaf: Any) -> jax.ShapeDtypeStruct | None:
+    if not leaf.size:
+      return None
     plain = jax.eval_shape(_key_data, leaf)
     sharding = None if _is_key(leaf) else getattr(leaf, "sharding", None)
     return jax.ShapeDtypeStruct(

@@ -14,8 +14,9 @@ from apnpql_jax.rollout import Policy
 from apnpql_jax.types import Array
 
 EPISODES = 4
-VIEW_SIZE = (216, 288)
-"""Height and width of the larger view, three times the global camera's."""
+VIEW_SIZE = (292, 388)
+"""Height and width of the larger view in pixels; both cameras fit beside it, the global
+one doubled and that on the wrist enlarged four times."""
 
 HOLD = 4
 """Frames for which the last instant of an episode stays, framed in green or red."""
@@ -34,23 +35,20 @@ def record_episodes(env: Env, policy: Policy, path: Path) -> None:
   write_video(path, frames, fps=1 / env.config.control_period_s)
 
 
-def film(
-  env: Env, policy: Policy, *, view_size: tuple[int, int] = VIEW_SIZE
-) -> list[np.ndarray]:
+def film(env: Env, policy: Policy) -> list[np.ndarray]:
   """Plays held-out episodes; u8[T, H, W, 3] each, from the first to the last instant,
   which is framed in green if the task was solved and in red if not.
 
   Args:
     env: the worlds.
     policy: what acts.
-    view_size: height and width of the larger view, pixels.
   """
   rows = env.bank_split + jnp.arange(EPISODES)
   states, running, solved = jax.jit(lambda key: _play(env, policy, rows, key))(
     jax.random.key(0)
   )
   cameras = (
-    camera_renderer(env.task.scene, "global", view_size),
+    camera_renderer(env.task.scene, "global", VIEW_SIZE),
     camera_renderer(env.task.scene, "global", GLOBAL_SIZE),
     camera_renderer(env.task.scene, "wrist", WRIST_SIZE),
   )

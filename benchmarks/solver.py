@@ -37,6 +37,7 @@ def main() -> None:
   )
   parser.add_argument("--episodes", type=int, default=64)
   args = parser.parse_args()
+  RESULT.parent.mkdir(exist_ok=True)
   measured = []
   for task in args.tasks:
     for setting in args.settings:

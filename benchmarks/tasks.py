@@ -14,6 +14,7 @@ import argparse
 import json
 import os
 from pathlib import Path
+import time
 
 import apnpql_jax  # noqa: F401  isort: skip  (before JAX: sets threads and cache)
 import imageio.v3 as iio
@@ -63,11 +64,13 @@ def measure(task: str, backend: str, *, episodes: int, seed: int) -> dict:
   config = EnvConfig(task=task, backend=backend, obs="state")
   figures = evaluate_expert(config, episodes=episodes, seed=seed, noise=0.0)
   built = make_task(task)
+  began = time.perf_counter()
   bank, report = load_bank(built, config.bank_rows)
+  load_seconds = time.perf_counter() - began
   return {
     **figures,
     "contacts": contact_report(built, backends=(backend,)),
-    "bank": {"rows": bank.rows, **vars(report)},
+    "bank": {"rows": bank.rows, "load_seconds": load_seconds, **vars(report)},
     "device": jax.devices()[0].device_kind,
     "cores": len(os.sched_getaffinity(0)),
     "versions": {module.__name__: module.__version__ for module in (jax, mujoco)},
@@ -79,36 +82,58 @@ def show(env: Env) -> None:
   policy = expert_policy(env, noise=0.0)
   folder = ROOT / "docs" / "tasks"
   record_episodes(env, policy, folder / f"{env.task.name}.mp4")
-  episode = film(env, policy, view_size=(288, 384))[0]
+  episode = film(env, policy)[0]
   chosen = np.linspace(0, len(episode) - 1, INSTANTS).round().astype(int)
   rows = [np.concatenate(list(episode[pair]), axis=1) for pair in chosen.reshape(2, -1)]
   iio.imwrite(folder / f"{env.task.name}.png", np.concatenate(rows))
 
 
 def write_table() -> None:
-  """Puts the table of all results at hand between the marks in docs/tasks.md."""
-  head = (
-    "| task | backend | solved | rate (95 %) | periods | physics steps/s | pairs "
-    "| contact slots | rows | draws rejected |"
+  """Puts the tables of all results at hand between the marks in docs/tasks.md."""
+  results = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))]
+  banks = {result["task"]: result["bank"] for result in results}
+  table = "\n".join(
+    [
+      "| task | backend | solved | rate (95 %) | periods | pairs | contact slots "
+      "| rows | physics steps/s |",
+      "|---" * 9 + "|",
+      *map(episodes_row, results),
+      "",
+      "| bank of resets | rows | draws rejected | residual of mink | built in "
+      "| loaded in |",
+      "|---" * 6 + "|",
+      *(bank_row(task, bank) for task, bank in banks.items()),
+    ]
   )
-  lines = [head, "|---" * 10 + "|"]
-  for path in sorted(RESULTS.glob("*.json")):
-    r = json.loads(path.read_text())
-    low, high = r["ci95"]
-    contacts, bank = r["contacts"], r["bank"]
-    rejected = bank["rejected_restless"] + bank["rejected_unreachable"]
-    lines.append(
-      f"| {r['task']} | {r['backend']} | {r['successes']} of {r['episodes']} "
-      f"| {100 * r['success_rate']:.1f} % ({100 * low:.1f} to {100 * high:.1f}) "
-      f"| {r['mean_length']:.1f} | {contacts[r['backend'] + '_steps_per_s']:,.0f} "
-      f"| {contacts['pairs']} | {contacts['contacts']} | {contacts['constraint_rows']} "
-      f"| {rejected} of {bank['drawn']} |"
-    )
   text = DOC.read_text()
   before, _, rest = text.partition("<!-- table -->")
   _, _, after = rest.partition("<!-- end -->")
-  table = "\n".join(lines)
   DOC.write_text(f"{before}<!-- table -->\n{table}\n<!-- end -->{after}")
+
+
+def episodes_row(result: dict) -> str:
+  """How the expert did and what the scene costs, on one engine."""
+  low, high = result["ci95"]
+  contacts = result["contacts"]
+  return (
+    f"| {result['task']} | {result['backend']} "
+    f"| {result['successes']} of {result['episodes']} "
+    f"| {100 * result['success_rate']:.1f} % ({100 * low:.1f} to {100 * high:.1f}) "
+    f"| {result['mean_length']:.1f} | {contacts['pairs']} | {contacts['contacts']} "
+    f"| {contacts['constraint_rows']} "
+    f"| {contacts[result['backend'] + '_steps_per_s']:,.0f} |"
+  )
+
+
+def bank_row(task: str, bank: dict) -> str:
+  """How the reset states came about."""
+  rejected = bank["rejected_restless"] + bank["rejected_unreachable"]
+  return (
+    f"| {task} | {bank['rows']:,} | {rejected} of {bank['drawn']:,} "
+    f"| {1e3 * bank['max_position_residual']:.2f} mm, "
+    f"{np.degrees(bank['max_rotation_residual']):.3f} degrees "
+    f"| {bank['seconds']:.0f} s | {bank['load_seconds']:.2f} s |"
+  )
 
 
 if __name__ == "__main__":

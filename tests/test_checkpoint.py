@@ -33,6 +33,7 @@ class State(struct.PyTreeNode):
   key: jax.Array
   keys: jax.Array
   raw_key: jax.Array
+  empty: jax.Array
   absent: jax.Array | None = None
 
 
@@ -51,6 +52,7 @@ def _state(seed: int = 0, images: int = 5) -> State:
     key=jax.random.key(seed),
     keys=jax.random.split(jax.random.key(seed, impl="rbg"), 3),
     raw_key=jax.random.PRNGKey(seed),
+    empty=jnp.zeros((4, 0, 3)),  # As mocap_pos of a scene without mocap bodies.
   )
 
 

@@ -15,6 +15,7 @@ import multiprocessing
 import os
 import pathlib
 import tempfile
+import time
 from typing import TYPE_CHECKING, Any
 
 from flax import struct
@@ -76,6 +77,7 @@ class BankReport:
   rejected_unreachable: int = 0
   max_position_residual: float = 0.0  # m
   max_rotation_residual: float = 0.0  # rad
+  seconds: float = 0.0  # to build it
 
 
 def load_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
@@ -94,6 +96,7 @@ def load_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
 
 def build_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
   """Draws, settles and solves ``rows`` reset states, with a progress bar on stderr."""
+  began = time.monotonic()
   rng = np.random.default_rng(SEED)
   report = BankReport()
   kept: list[ResetBank] = []
@@ -115,6 +118,7 @@ def build_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
         task, state, variant, pool, report, lambda n: progress.advance(bar, n)
       )
       kept.append(jax.tree.map(lambda x: x[:missing], solved))
+  report.seconds = time.monotonic() - began
   return jax.tree.map(lambda *parts: jnp.concatenate(parts), *kept), report
 
 

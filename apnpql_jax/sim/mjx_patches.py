@@ -20,10 +20,9 @@ def patch_mjx() -> None:
   each child: on a chain of eight bodies stock MJX is three orders of magnitude slower
   under vmap. An optimisation barrier behind every body ends it.
 
-  Elliptic cones: the solver multiplies the Jacobian by a dense matrix of
-  rows x rows to add up the Hessians of the cones, of which only a block of at most 6 x 6
-  per contact differs from zero. Summing over the blocks makes cost and memory linear in
-  the number of rows.
+  Elliptic cones: to add up their Hessians, the solver multiplies the Jacobian by a
+  dense matrix of rows x rows, of which only a block of at most 6 x 6 per contact
+  differs from zero. Summing over the blocks makes cost and memory linear in the rows.
   """
   if jax.default_backend() == "cpu":
     _scan.body_tree = _guarded_body_tree
