@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hand_made import put, tool_at
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -45,19 +46,11 @@ def half_heights() -> np.ndarray:
   return np.array(flip_cup.SHAPES)[np.arange(WORLDS) % 3, 2] / 2
 
 
-def put(task, state, where, turn: Rotation):
-  """Moves the cup to f64[worlds, 3] and turns it."""
-  address, _ = task.scene.free_joint("cup")
-  qpos = state.qpos.at[:, address : address + 3].set(jnp.asarray(where))
-  quat = turn.as_quat(scalar_first=True)
-  return state.replace(qpos=qpos.at[:, address + 3 : address + 7].set(quat))
-
-
 def on_goal(task, state, half_heights, shift=(0.0, 0.0, 0.0), turn=UPRIGHT):
   goal = np.asarray(state.mocap_pos[:, task.scene.mocap("goal")])
   where = goal + np.asarray(shift)
   where[:, 2] += half_heights
-  return put(task, state, where, turn)
+  return put(task, state, "cup", where, turn)
 
 
 def judge(task, state, kinematics) -> np.ndarray:
@@ -141,11 +134,7 @@ def hand(task, state, kinematics, cup, roll: float):
   mat = np.stack([left, up, reach], -1) @ Rotation.from_euler("z", roll).as_matrix()
   width = 2 * np.array(flip_cup.SHAPES)[np.arange(WORLDS) % 3, 1]
   tool = cup + np.asarray(pinch_height(width))[:, None] * reach
-  site = task.scene.tool_site
-  return kinematics.replace(
-    site_xpos=kinematics.site_xpos.at[:, site].set(tool),
-    site_xmat=kinematics.site_xmat.at[:, site].set(mat),
-  )
+  return tool_at(task, kinematics, tool, mat)
 
 
 def gripping(task, state):
@@ -176,9 +165,9 @@ def test_a_held_cup_is_lifted_and_turned_on(task, resets, kinematics_of, flip):
   flat = cup * [1, 1, 0]
   reach = flat / np.linalg.norm(flat, axis=-1, keepdims=True)
   heading = Rotation.from_euler("z", np.arctan2(reach[:, 1:2], reach[:, :1]))
-  state = gripping(task, put(task, resets, cup, heading * UPSIDE_DOWN))
+  state = gripping(task, put(task, resets, "cup", cup, heading * UPSIDE_DOWN))
   turned = Rotation.from_rotvec(flip * reach) * heading * UPSIDE_DOWN
-  state = put(task, state, cup, turned)
+  state = put(task, state, "cup", cup, turned)
   held = hand(task, state, kinematics_of(state), cup, flip - np.pi / 2)
   positions, rotations = task.tool_targets(state, held)
   tool = held.site_xpos[:, task.scene.tool_site]

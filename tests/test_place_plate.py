@@ -4,6 +4,15 @@ from __future__ import annotations
 
 import itertools
 
+from hand_made import (
+  drawn,
+  neutral_tool,
+  pos,
+  put,
+  rotation,
+  tool_at,
+  with_gap,
+)
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -15,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.tasks import make_task, place_plate, task_names
-from apnpql_jax.tasks.pinch import ALIGNED, FUNNEL, finger_angle, pinch_height
+from apnpql_jax.tasks.pinch import ALIGNED, FUNNEL, pinch_height
 
 WORLDS = 16
 OPEN = 0.1
@@ -39,8 +48,7 @@ def task():
 
 @pytest.fixture(scope="module")
 def resets(task):
-  draw = task.sample_resets(np.random.default_rng(3), WORLDS)
-  return physics.initial_state(task.scene, *map(jnp.asarray, draw))
+  return drawn(task, WORLDS)
 
 
 @pytest.fixture(scope="module")
@@ -58,12 +66,7 @@ def step(task):
 
 @pytest.fixture(scope="module")
 def neutral(task):
-  """Position and rotation of the tool at the keyframe, from C MuJoCo."""
-  data = mujoco.MjData(task.scene.model)
-  mujoco.mj_resetDataKeyframe(task.scene.model, data, 0)
-  mujoco.mj_kinematics(task.scene.model, data)
-  tool = data.site("tool")
-  return tool.xpos.copy(), tool.xmat.reshape(3, 3).copy()
+  return neutral_tool(task)
 
 
 def lying(steep=0.0, heading=0.0) -> Rotation:
@@ -74,17 +77,6 @@ def lying(steep=0.0, heading=0.0) -> Rotation:
 STANDING = lying(np.pi / 2)
 
 
-def pos(task, state):
-  address, _ = task.scene.free_joint("plate")
-  return state.qpos[:, address : address + 3]
-
-
-def rotation(task, qpos) -> Rotation:
-  address, _ = task.scene.free_joint("plate")
-  quat = np.asarray(qpos[:, address + 3 : address + 7], np.float64)
-  return Rotation.from_quat(quat, scalar_first=True)
-
-
 def mocap(task, state, body) -> tuple[np.ndarray, Rotation]:
   index = task.scene.mocap(body)
   quat = np.asarray(state.mocap_quat[:, index], np.float64)
@@ -92,19 +84,10 @@ def mocap(task, state, body) -> tuple[np.ndarray, Rotation]:
   return where, Rotation.from_quat(quat, scalar_first=True)
 
 
-def put(task, state, where, turn: Rotation | None = None):
-  address, _ = task.scene.free_joint("plate")
-  qpos = state.qpos.at[:, address : address + 3].set(where)
-  if turn is not None:
-    quat = turn.as_quat(scalar_first=True)
-    qpos = qpos.at[:, address + 3 : address + 7].set(quat)
-  return state.replace(qpos=qpos)
-
-
 def in_box(task, state, where, turn: Rotation = STANDING):
   """Puts the plate into the box's frame."""
   origin, frame = mocap(task, state, "goal")
-  return put(task, state, origin + frame.apply(where), frame * turn)
+  return put(task, state, "plate", origin + frame.apply(where), frame * turn)
 
 
 def moved(task, state, body, shift):
@@ -112,25 +95,12 @@ def moved(task, state, body, shift):
   return state.replace(mocap_pos=state.mocap_pos.at[:, index].add(jnp.array(shift)))
 
 
-def with_gap(task, state, gap):
-  """The pads are ``gap`` apart."""
-  fingers = [task.scene.model.joint(f"finger_{x}") for x in ("r1", "r2", "l1", "l2")]
-  address = np.array([finger.qposadr[0] for finger in fingers])
-  return state.replace(qpos=state.qpos.at[:, address].set(finger_angle(gap)))
-
-
-def tool_at(task, kinematics, where, mat=None):
-  tool = task.scene.tool_site
-  kinematics = kinematics.replace(site_xpos=kinematics.site_xpos.at[:, tool].set(where))
-  if mat is None:
-    return kinematics
-  return kinematics.replace(site_xmat=kinematics.site_xmat.at[:, tool].set(mat))
-
-
 def hand_at(task, state, kinematics, neutral, shift=(0.0, 0.0, 0.0), twist=0.0):
   """A vertical tool at ``shift`` from its grasp of a standing plate, turned."""
-  where = pos(task, state) + jnp.array([0.0, 0.0, RIM + GRASP]) + jnp.array(shift)
-  axis = rotation(task, state.qpos).as_matrix()[:, :, 2]
+  where = (
+    pos(task, state, "plate") + jnp.array([0.0, 0.0, RIM + GRASP]) + jnp.array(shift)
+  )
+  axis = rotation(task, state, "plate").as_matrix()[:, :, 2]
   heading = np.arctan2(axis[:, 1], axis[:, 0])[:, None]
   turn = Rotation.from_euler("z", heading + twist).as_matrix()
   return tool_at(task, kinematics, where, turn @ neutral[1])
@@ -208,9 +178,11 @@ def test_the_plate_stands_in_the_middle_of_its_holder(task, draw):
   spot, frame = mocap(task, draw, "holder")
   height = task.scene.keyframe("neutral")[task.scene.free_joint("plate")[0] + 2]
   assert height == pytest.approx(RADIUS, abs=1e-4)
-  np.testing.assert_allclose(pos(task, draw), spot + [0, 0, height], atol=1e-12)
+  np.testing.assert_allclose(
+    pos(task, draw, "plate"), spot + [0, 0, height], atol=1e-12
+  )
   # The jaws are opposite each other on the holder's x axis.
-  axis = frame.inv().apply(rotation(task, draw.qpos).as_matrix()[:, :, 2])
+  axis = frame.inv().apply(rotation(task, draw, "plate").as_matrix()[:, :, 2])
   np.testing.assert_allclose(axis, np.tile([1, 0, 0], (4000, 1)), atol=1e-6)
 
 
@@ -242,8 +214,12 @@ def test_a_reset_is_at_rest(task, resets, step):
   state = resets
   for _ in range(4):
     state = step(state)
-  np.testing.assert_allclose(pos(task, state), pos(task, resets), atol=1e-3)
-  axis, before = (rotation(task, x.qpos).as_matrix()[:, :, 2] for x in (state, resets))
+  np.testing.assert_allclose(
+    pos(task, state, "plate"), pos(task, resets, "plate"), atol=1e-3
+  )
+  axis, before = (
+    rotation(task, x, "plate").as_matrix()[:, :, 2] for x in (state, resets)
+  )
   np.testing.assert_allclose(axis, before, atol=0.02)
 
 
@@ -322,7 +298,7 @@ def test_the_goal_is_where_the_box_is(task, resets, solved, kinematics):
   assert not judge(task, moved(task, solved, "goal", (0.2, 0, 0)), kinematics).any()
   assert judge(task, moved(task, solved, "holder", (0.2, 0, 0)), kinematics).all()
   origin, frame = mocap(task, resets, "holder")
-  flat = put(task, resets, origin + [0, 0, FLOOR], frame)
+  flat = put(task, resets, "plate", origin + [0, 0, FLOOR], frame)
   assert not judge(task, flat, kinematics).any()
 
 
@@ -346,7 +322,7 @@ def test_the_hand_must_be_away(
   tilt = turn.as_matrix()[2, 2]
   height = RADIUS * np.sqrt(1 - tilt**2)
   state = in_box(task, resets, (0.0, 0.0, height), turn)
-  tool = pos(task, state).at[:, 2].add(GRASP).at[:, axis].add(distance)
+  tool = pos(task, state, "plate").at[:, 2].add(GRASP).at[:, axis].add(distance)
   hand = tool_at(task, kinematics, tool, neutral[1])
   assert (judge(task, state, hand) == expected).all()
 
@@ -368,11 +344,11 @@ def test_a_plate_let_go_in_the_box_stays_in_it(task, resets, kinematics, step, s
 
 def edge(task, state):
   """Highest point of a circle just inside the plate's edge, by trying all."""
-  mat = rotation(task, state.qpos).as_matrix()
+  mat = rotation(task, state, "plate").as_matrix()
   angle = np.linspace(0, 2 * np.pi, 20001)
   circle = RIM * np.stack([np.cos(angle), np.sin(angle), 0 * angle])
   highest = (mat[:, 2] @ circle).argmax(-1)
-  return pos(task, state) + jnp.asarray(
+  return pos(task, state, "plate") + jnp.asarray(
     (mat @ circle)[np.arange(len(mat)), :, highest], jnp.float32
   )
 
@@ -411,7 +387,7 @@ def test_object_target(task, resets, kinematics, neutral, shift, gap, twist, fun
   hand = hand_at(task, state, kinematics, neutral, shift, twist)
   positions, _ = task.tool_targets(state, hand)
   height = RIM + GRASP + place_plate.HOVER * funnel
-  expected = pos(task, state) + jnp.array([0.0, 0.0, height])
+  expected = pos(task, state, "plate") + jnp.array([0.0, 0.0, height])
   np.testing.assert_allclose(positions[:, 0], expected, atol=1e-5)
 
 
@@ -420,7 +396,7 @@ def test_object_target(task, resets, kinematics, neutral, shift, gap, twist, fun
 def test_a_leaning_plate_is_gripped_at_its_highest_edge(
   task, resets, kinematics, neutral, steep, heading
 ):
-  state = put(task, resets, pos(task, resets), lying(steep, heading))
+  state = put(task, resets, "plate", pos(task, resets, "plate"), lying(steep, heading))
   tool = edge(task, state).at[:, 2].add(GRASP)
   turn = Rotation.from_euler("z", heading).as_matrix()
   hand = tool_at(task, kinematics, tool, turn @ neutral[1])
@@ -434,10 +410,12 @@ def test_a_leaning_plate_is_gripped_at_its_highest_edge(
 @pytest.mark.parametrize("steep", [0.0, 1e-4, np.pi])
 def test_a_lying_plate_has_its_middle_as_target(task, resets, kinematics, steep):
   """It has no highest edge; what matters is that the target does not jump or break."""
-  state = put(task, resets, pos(task, resets), lying(steep))
+  state = put(task, resets, "plate", turn=lying(steep))
   high = tool_at(task, kinematics, jnp.array([0.5, 0.0, 0.3]))
   positions, rotations = task.tool_targets(state, high)
-  np.testing.assert_allclose(positions[:, 0, :2], pos(task, state)[:, :2], atol=1e-4)
+  np.testing.assert_allclose(
+    positions[:, 0, :2], pos(task, state, "plate")[:, :2], atol=1e-4
+  )
   assert np.isfinite(positions).all() and np.isfinite(rotations).all()
 
 
@@ -489,7 +467,7 @@ def test_a_held_plate_is_carried_into_the_box(
   """The plate, not the tool, arrives at the goal: 3 mm above the floor at last."""
   goal, frame = mocap(task, resets, "goal")
   start = goal + [0.0, away, RADIUS + height]
-  state = with_gap(task, put(task, resets, start), THICKNESS)
+  state = with_gap(task, put(task, resets, "plate", start), THICKNESS)
   hand = hand_at(task, state, kinematics, neutral, (0.0, slip, 0.0))
   positions, rotations = task.tool_targets(state, hand)
   step = positions[:, 1] - hand.site_xpos[:, task.scene.tool_site]
@@ -497,7 +475,7 @@ def test_a_held_plate_is_carried_into_the_box(
   expected[:, 2] = RADIUS + 0.003 + place_plate.LIFT * far
   np.testing.assert_allclose(start + step, expected, atol=1e-5)
   # A plate that is not free yet is not turned; a free one is, across the box.
-  plate = rotation(task, state.qpos).as_matrix()[:, :, 2]
+  plate = rotation(task, state, "plate").as_matrix()[:, :, 2]
   axis = frame.as_matrix()[:, :, 0] if free == 1 else plate
   closing = np.asarray(rotations[:, 1, :, 1])
   np.testing.assert_allclose(np.abs((closing * axis).sum(-1)), 1, atol=1e-4)
@@ -524,10 +502,12 @@ def test_the_neutral_target_is_the_keyframe(task, resets, kinematics, neutral):
 @pytest.mark.parametrize("heading", [0.0, 1.4, 1.8, -2.5, 3.0])
 def test_the_fingers_close_across_the_plate(task, resets, kinematics, neutral, heading):
   """Of two ways, on that which is less turned from neutral; the tool points down."""
-  state = put(task, resets, pos(task, resets), lying(np.pi / 2, heading))
+  state = put(
+    task, resets, "plate", pos(task, resets, "plate"), lying(np.pi / 2, heading)
+  )
   target = np.asarray(task.tool_targets(state, kinematics)[1])[:, 0]
   np.testing.assert_allclose(target[:, 2, 2], -1, atol=1e-3)
-  axis = rotation(task, state.qpos).as_matrix()[:, :, 2]
+  axis = rotation(task, state, "plate").as_matrix()[:, :, 2]
   closing = (target[:, :, 1] * axis).sum(-1)
   np.testing.assert_allclose(np.abs(closing), 1, atol=1e-4)
   turned = Rotation.from_matrix(target) * Rotation.from_matrix(neutral[1]).inv()

@@ -2,6 +2,15 @@
 
 from __future__ import annotations
 
+from hand_made import (
+  drawn,
+  neutral_tool,
+  pos,
+  put,
+  rotation,
+  tool_at,
+  with_gap,
+)
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -13,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.tasks import make_task, stack_box, task_names
-from apnpql_jax.tasks.pinch import ALIGNED, FUNNEL, finger_angle, pinch_height
+from apnpql_jax.tasks.pinch import ALIGNED, FUNNEL, pinch_height
 
 WORLDS = 16
 OPEN = 0.1
@@ -32,8 +41,7 @@ def task():
 
 @pytest.fixture(scope="module")
 def resets(task):
-  draw = task.sample_resets(np.random.default_rng(3), WORLDS)
-  return physics.initial_state(task.scene, *map(jnp.asarray, draw))
+  return drawn(task, WORLDS)
 
 
 @pytest.fixture(scope="module")
@@ -50,60 +58,22 @@ def solved(task, resets):
 
 @pytest.fixture(scope="module")
 def neutral(task):
-  """Position and rotation of the tool at the keyframe, from C MuJoCo."""
-  data = mujoco.MjData(task.scene.model)
-  mujoco.mj_resetDataKeyframe(task.scene.model, data, 0)
-  mujoco.mj_kinematics(task.scene.model, data)
-  tool = data.site("tool")
-  return tool.xpos.copy(), tool.xmat.reshape(3, 3).copy()
-
-
-def pos(task, state, body):
-  address, _ = task.scene.free_joint(body)
-  return state.qpos[:, address : address + 3]
-
-
-def rotation(task, qpos, body) -> Rotation:
-  address, _ = task.scene.free_joint(body)
-  quat = np.asarray(qpos[:, address + 3 : address + 7], np.float64)
-  return Rotation.from_quat(quat, scalar_first=True)
-
-
-def put(task, state, body, where=None, turn: Rotation | None = None):
-  """Moves a body to ``where`` and turns it, from the pose it has in ``state``."""
-  address, _ = task.scene.free_joint(body)
-  qpos = state.qpos
-  if where is not None:
-    qpos = qpos.at[:, address : address + 3].set(where)
-  if turn is not None:
-    quat = (rotation(task, qpos, body) * turn).as_quat(scalar_first=True)
-    qpos = qpos.at[:, address + 3 : address + 7].set(quat)
-  return state.replace(qpos=qpos)
+  return neutral_tool(task)
 
 
 def moved(task, state, body, shift):
   return put(task, state, body, pos(task, state, body) + jnp.array(shift))
 
 
-def with_gap(task, state, gap):
-  """The pads are ``gap`` apart."""
-  fingers = [task.scene.model.joint(f"finger_{x}") for x in ("r1", "r2", "l1", "l2")]
-  address = np.array([finger.qposadr[0] for finger in fingers])
-  return state.replace(qpos=state.qpos.at[:, address].set(finger_angle(gap)))
-
-
-def tool_at(task, kinematics, where, mat=None):
-  tool = task.scene.tool_site
-  kinematics = kinematics.replace(site_xpos=kinematics.site_xpos.at[:, tool].set(where))
-  if mat is None:
-    return kinematics
-  return kinematics.replace(site_xmat=kinematics.site_xmat.at[:, tool].set(mat))
+def turned(task, state, body, turn: Rotation):
+  """Turned in its own frame."""
+  return put(task, state, body, turn=rotation(task, state, body) * turn)
 
 
 def hand_at(task, state, kinematics, neutral, shift, twist=0.0):
   """A vertical tool at ``shift`` from its grasp of yellow, turned by ``twist``."""
   where = pos(task, state, "yellow") + jnp.array([0.0, 0.0, GRASP]) + jnp.array(shift)
-  heading = rotation(task, state.qpos, "yellow").as_euler("ZYX")[:, :1]
+  heading = rotation(task, state, "yellow").as_euler("ZYX")[:, :1]
   turn = Rotation.from_euler("z", heading + twist).as_matrix()
   return tool_at(task, kinematics, where, turn @ neutral[1])
 
@@ -113,8 +83,8 @@ def test_it_is_registered():
 
 
 @pytest.fixture(scope="module")
-def draws(task):
-  return task.sample_resets(np.random.default_rng(0), 4000).qpos
+def draw(task):
+  return task.sample_resets(np.random.default_rng(0), 4000)
 
 
 def share(values, low, high):
@@ -131,27 +101,27 @@ def test_resets_are_unsolved(task, resets, kinematics):
   assert not task.success(resets, kinematics).any()
 
 
-def test_resets_are_uniform_in_range(task, draws):
+def test_resets_are_uniform_in_range(task, draw):
   scene = task.scene
-  arm = draws[:, scene.arm_qpos] - scene.keyframe("neutral")[scene.arm_qpos]
+  arm = draw.qpos[:, scene.arm_qpos] - scene.keyframe("neutral")[scene.arm_qpos]
   assert_uniform(share(arm, -task.arm_noise, task.arm_noise))
   for body in ("yellow", "blue"):
-    turn = rotation(task, draws, body).as_rotvec()
+    turn = rotation(task, draw, body).as_rotvec()
     np.testing.assert_allclose(turn[:, :2], 0, atol=1e-12)
     assert_uniform(share(turn[:, 2], -stack_box.MAX_YAW, stack_box.MAX_YAW))
 
 
-def test_what_is_drawn_is_independent(task, draws):
-  turns = [rotation(task, draws, body).as_rotvec() for body in ("yellow", "blue")]
+def test_what_is_drawn_is_independent(task, draw):
+  turns = [rotation(task, draw, body).as_rotvec() for body in ("yellow", "blue")]
   turns = np.stack([turn[:, 2] for turn in turns])
-  correlation = np.corrcoef(np.vstack([draws[:, task.scene.arm_qpos].T, turns]))
+  correlation = np.corrcoef(np.vstack([draw.qpos[:, task.scene.arm_qpos].T, turns]))
   np.testing.assert_allclose(correlation, np.eye(8), atol=0.07)  # Over four sigma.
 
 
-def test_the_pair_is_uniform_where_it_may_be(task, draws):
+def test_the_pair_is_uniform_where_it_may_be(task, draw):
   """By rejection of pairs drawn here."""
   spots = np.hstack(
-    [draws[:, a : a + 2] for a, _ in map(task.scene.free_joint, ("yellow", "blue"))]
+    [draw.qpos[:, a : a + 2] for a, _ in map(task.scene.free_joint, ("yellow", "blue"))]
   )
   low, high = np.tile(np.array(stack_box.WORKSPACE).T, 2)
   assert (spots >= low).all() and (spots <= high).all()
@@ -168,17 +138,17 @@ def test_the_pair_is_uniform_where_it_may_be(task, draws):
     assert stats.ks_2samp(actual[:, column], expected[:, column]).pvalue > 1e-3
 
 
-def test_the_rest_of_a_reset_is_the_keyframe(task, draws):
-  drawn = list(task.scene.arm_qpos)
+def test_the_rest_of_a_reset_is_the_keyframe(task, draw):
+  varied = list(task.scene.arm_qpos)
   for body in ("yellow", "blue"):
     address, _ = task.scene.free_joint(body)
-    drawn += [address, address + 1, *range(address + 3, address + 7)]
-  neutral = np.delete(task.scene.keyframe("neutral"), drawn)
-  rest = np.delete(draws, drawn, axis=1)
+    varied += [address, address + 1, *range(address + 3, address + 7)]
+  neutral = np.delete(task.scene.keyframe("neutral"), varied)
+  rest = np.delete(draw.qpos, varied, axis=1)
   np.testing.assert_array_equal(rest, np.broadcast_to(neutral, rest.shape))
 
 
-def test_nothing_touches_but_the_boxes_the_table(task, draws):
+def test_nothing_touches_but_the_boxes_the_table(task, draw):
   model = task.scene.model
   data = mujoco.MjData(model)
 
@@ -186,7 +156,7 @@ def test_nothing_touches_but_the_boxes_the_table(task, draws):
     ids = (model.geom(name).id for name in (one, other))
     return mujoco.mj_geomDistance(model, data, *ids, 1.0, None)
 
-  for qpos in draws[:200]:
+  for qpos in draw.qpos[:200]:
     data.qpos[:] = qpos
     mujoco.mj_forward(model, data)
     assert (np.abs(data.contact.dist) < 1e-6).all()
@@ -255,7 +225,7 @@ def test_the_stack_may_have_moved_but_only_as_a_whole(task, solved, kinematics):
 )
 def test_a_box_may_lie_on_any_face(task, solved, kinematics, body, axis, angle):
   """Its faces look the same."""
-  state = put(task, solved, body, turn=Rotation.from_euler(axis, angle))
+  state = turned(task, solved, body, Rotation.from_euler(axis, angle))
   assert judge(task, state, kinematics).all()
 
 
@@ -263,7 +233,7 @@ def test_a_box_may_lie_on_any_face(task, solved, kinematics, body, axis, angle):
 def test_a_yellow_box_that_is_tipped_is_no_success(task, solved, kinematics, angle):
   """With an edge on the blue box: its centre is higher than that of a lying one."""
   height = stack_box.SIDE / 2 * (np.cos(angle) + np.sin(angle) - 1)
-  state = put(task, solved, "yellow", turn=Rotation.from_euler("y", angle))
+  state = turned(task, solved, "yellow", Rotation.from_euler("y", angle))
   state = moved(task, state, "yellow", (0.0, 0.0, height))
   assert not judge(task, state, kinematics).any()
 
@@ -410,18 +380,18 @@ def test_the_neutral_target_is_the_keyframe(task, resets, kinematics, neutral):
 @pytest.mark.parametrize("turn", [0.0, 1.0, 2.5, -2.0])
 def test_the_fingers_close_on_faces(task, resets, kinematics, neutral, row, body, turn):
   """Of four ways, on that which is least turned from neutral; the tool points down."""
-  state = put(task, resets, body, turn=Rotation.from_euler("z", turn))
+  state = turned(task, resets, body, Rotation.from_euler("z", turn))
   target = np.asarray(task.tool_targets(state, kinematics)[1])[:, row]
   np.testing.assert_allclose(target[:, 2, 2], -1, atol=1e-3)
-  face = rotation(task, state.qpos, body).inv().apply(target[:, :, 1])
+  face = rotation(task, state, body).inv().apply(target[:, :, 1])
   np.testing.assert_allclose(np.abs(face).max(-1), 1, atol=1e-4)
-  turned = Rotation.from_matrix(target) * Rotation.from_matrix(neutral[1]).inv()
-  assert (turned.magnitude() < np.pi / 4 + 1e-3).all()
+  difference = Rotation.from_matrix(target) * Rotation.from_matrix(neutral[1]).inv()
+  assert (difference.magnitude() < np.pi / 4 + 1e-3).all()
 
 
 def faces(task, state, body) -> np.ndarray:
   """Centre of the box and of its face nearest to the world's x axis, f64[n, 6]."""
-  mat = rotation(task, state.qpos, body).as_matrix()
+  mat = rotation(task, state, body).as_matrix()
   normals = np.concatenate([mat, -mat], axis=-1)  # f64[n, 3, 6]
   nearest = normals[:, 0].argmax(-1)
   normal = normals[np.arange(len(mat)), :, nearest]
@@ -438,7 +408,7 @@ def test_objects_are_the_boxes_and_their_faces(task, resets, turn, face):
   state = resets
   for body in ("yellow", "blue"):
     lying = Rotation.from_euler("z", turn) * Rotation.from_euler(*face)
-    state = put(task, state, body, turn=lying)
+    state = turned(task, state, body, lying)
   state = moved(task, state, "yellow", (0.01, 0.02, 0.03))
   expected = [faces(task, state, body) for body in ("yellow", "blue")]
   np.testing.assert_allclose(task.objects(state), np.hstack(expected), atol=5e-6)

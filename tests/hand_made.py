@@ -1,0 +1,72 @@
+"""States made by hand: bodies, pads and tool put where a test wants them."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from apnpql_jax.sim import physics
+from apnpql_jax.sim.kinematics import Kinematics
+from apnpql_jax.sim.physics import PhysicsState
+from apnpql_jax.tasks import Task
+from apnpql_jax.tasks.pinch import finger_angle
+
+
+def drawn(task: Task, worlds: int, *, seed: int = 3) -> PhysicsState:
+  """Initial states as the task draws them."""
+  draw = task.sample_resets(np.random.default_rng(seed), worlds)
+  return physics.initial_state(task.scene, *map(jnp.asarray, draw))
+
+
+def neutral_tool(task: Task) -> tuple[np.ndarray, np.ndarray]:
+  """Position f64[3] and rotation f64[3, 3] at the keyframe, from C MuJoCo."""
+  data = mujoco.MjData(task.scene.model)
+  mujoco.mj_resetDataKeyframe(task.scene.model, data, 0)
+  mujoco.mj_kinematics(task.scene.model, data)
+  tool = data.site("tool")
+  return tool.xpos.copy(), tool.xmat.reshape(3, 3).copy()
+
+
+def pos(task: Task, state: PhysicsState, body: str):
+  """f32[worlds, 3] of a free body."""
+  address, _ = task.scene.free_joint(body)
+  return state.qpos[:, address : address + 3]
+
+
+def rotation(task: Task, state: PhysicsState, body: str) -> Rotation:
+  """Of a free body, one per world."""
+  address, _ = task.scene.free_joint(body)
+  quat = np.asarray(state.qpos[:, address + 3 : address + 7], np.float64)
+  return Rotation.from_quat(quat, scalar_first=True)
+
+
+def put(
+  task: Task, state: PhysicsState, body: str, where=None, turn: Rotation | None = None
+) -> PhysicsState:
+  """Moves a free body to ``where`` and gives it the rotation ``turn``, if stated."""
+  address, _ = task.scene.free_joint(body)
+  qpos = state.qpos
+  if where is not None:
+    qpos = qpos.at[:, address : address + 3].set(jnp.asarray(where))
+  if turn is not None:
+    quat = turn.as_quat(scalar_first=True)
+    qpos = qpos.at[:, address + 3 : address + 7].set(quat)
+  return state.replace(qpos=qpos)
+
+
+def with_gap(task: Task, state: PhysicsState, gap: float) -> PhysicsState:
+  """The pads are ``gap`` m apart."""
+  fingers = [task.scene.model.joint(f"finger_{x}") for x in ("r1", "r2", "l1", "l2")]
+  address = np.array([finger.qposadr[0] for finger in fingers])
+  return state.replace(qpos=state.qpos.at[:, address].set(finger_angle(gap)))
+
+
+def tool_at(task: Task, kinematics: Kinematics, where, mat=None) -> Kinematics:
+  """The tool at ``where`` and, if stated, with the rotation ``mat``."""
+  tool = task.scene.tool_site
+  kinematics = kinematics.replace(site_xpos=kinematics.site_xpos.at[:, tool].set(where))
+  if mat is None:
+    return kinematics
+  return kinematics.replace(site_xmat=kinematics.site_xmat.at[:, tool].set(mat))
