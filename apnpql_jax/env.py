@@ -142,10 +142,10 @@ class Env:
   ) -> EnvState:
     """Judges, labels and observes the instant the worlds have come to."""
     kinematics = self._kinematics(state)
-    poses = self.task.tool_targets(state, kinematics)
+    *pose, close = self.task.tool_targets(state, kinematics)
     q = state.qpos[:, self.task.scene.arm_qpos]
     present = jnp.broadcast_to(q[:, None], targets.shape)
-    targets = tracking.refine(self._chain, targets, present, *poses)
+    targets = tracking.refine(self._chain, targets, present, *pose)
     solved = self.task.success(state, kinematics) & ~fresh
     late = (elapsed >= self.config.episode_steps) & ~fresh
     timestep = TimeStep(
@@ -153,7 +153,9 @@ class Env:
       reward=solved.astype(jnp.float32),
       terminated=solved,
       truncated=late & ~solved,
-      primitives=tracking.follow(targets, q[:, None]),
+      primitives=jnp.concatenate(
+        [tracking.follow(targets, q[:, None]), close[..., None]], axis=-1
+      ),
     )
     return EnvState(state, targets, elapsed, timestep)
 

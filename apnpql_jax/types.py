@@ -41,7 +41,7 @@ class TimeStep(struct.PyTreeNode):
   reward: Array  # f32[*b]: received on arriving here
   terminated: Array  # bool[*b]: arrived by success; do not bootstrap
   truncated: Array  # bool[*b]: arrived by time-out; bootstrap
-  primitives: Array  # f32[*b, 3, 6]: privileged labels of the primitives, rad/s
+  primitives: Array  # f32[*b, 3, 7]: privileged labels of the primitives, actions
 
   @property
   def last(self) -> Array:
@@ -57,5 +57,5 @@ class Transition(struct.PyTreeNode):
   reward_t: Array  # f32[B]: discounted sum of up to N rewards
   discount_t: Array  # f32[B]: gamma^m, zero where the episode terminated
   observation_t: Observation  # [B, ...]: state to bootstrap from
-  primitives_tm1: Array  # f32[B, 3, 6]: labels of the action primitives
+  primitives_tm1: Array  # f32[B, 3, 7]: labels of the action primitives
   weight: Array  # f32[B]: one where the transition is real, zero where it is not

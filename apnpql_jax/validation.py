@@ -22,7 +22,7 @@ OBSERVATIONS = ("pixels", "state")
 MIN_BANK_ROWS = 16
 
 _PIXEL_BYTES = 3 * (72 * 96 + 36 * 64)
-_OTHER_BYTES = 4 * (21 + 3 + 7 + 18 + 1) + 2
+_OTHER_BYTES = 4 * (21 + 3 + 7 + 21 + 1) + 2
 """Robot state, tool, action, primitive labels, reward (f32) and the two end flags."""
 
 _POSITIVE = (

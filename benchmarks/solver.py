@@ -4,8 +4,8 @@
   python benchmarks/solver.py --tasks flip_cup --settings 20x20 10x10
 
 A setting is ITERATIONSxLS_ITERATIONS. For each, the scripted expert plays held-out
-episodes on one engine, and the scene's speed is measured. Writes results/solver.json
-beside this file and prints the table.
+episodes on one engine, and the scene's speed is measured. Adds to results/solver.json
+beside this file, in place of what was there for the same task, engine and setting.
 """
 
 from __future__ import annotations
@@ -38,20 +38,15 @@ def main() -> None:
   parser.add_argument("--episodes", type=int, default=64)
   args = parser.parse_args()
   RESULT.parent.mkdir(exist_ok=True)
-  measured = []
+  results = json.loads(RESULT.read_text()) if RESULT.exists() else {}
   for task in args.tasks:
     for setting in args.settings:
       iterations, ls_iterations = map(int, setting.split("x"))
-      figures = {
-        "task": task,
-        "backend": args.backend,
-        "iterations": iterations,
-        "ls_iterations": ls_iterations,
-        **measure(task, args.backend, iterations, ls_iterations, args.episodes),
-      }
-      print(json.dumps(figures), flush=True)
-      measured.append(figures)
-      RESULT.write_text(json.dumps(measured, indent=2) + "\n")
+      figures = measure(task, args.backend, iterations, ls_iterations, args.episodes)
+      name = f"{task} {args.backend} {setting}"
+      print(name, figures, flush=True)
+      results[name] = figures
+      RESULT.write_text(json.dumps(results, indent=2, sort_keys=True) + "\n")
 
 
 def measure(

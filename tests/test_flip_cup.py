@@ -169,7 +169,7 @@ def test_a_held_cup_is_lifted_and_turned_on(task, resets, kinematics_of, flip):
   turned = Rotation.from_rotvec(flip * reach) * heading * UPSIDE_DOWN
   state = put(task, state, "cup", cup, turned)
   held = hand(task, state, kinematics_of(state), cup, flip - np.pi / 2)
-  positions, rotations = task.tool_targets(state, held)
+  positions, rotations, _ = task.tool_targets(state, held)
   tool = held.site_xpos[:, task.scene.tool_site]
   # The object primitive stays with the cup, in the hand's own orientation.
   np.testing.assert_allclose(positions[:, 0], tool, atol=1e-4)

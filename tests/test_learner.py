@@ -62,7 +62,9 @@ def random_batch(seed: int, batch: int = BATCH, *, pixels: bool = False) -> Tran
     reward_t=success,
     discount_t=0.97 * (1.0 - success),
     observation_t=observation(),
-    primitives_tm1=jnp.tanh(normal(batch, 3, 6)),
+    primitives_tm1=jnp.concatenate(
+      [jnp.tanh(normal(batch, 3, 6)), (normal(batch, 3, 1) > 0).astype(jnp.float32)], -1
+    ),
     weight=jnp.ones(batch),
   )
 
@@ -238,7 +240,7 @@ def test_both_cameras_are_trained_by_the_value(agent, camera: str):
 
 def test_actions_lie_in_the_action_box(agent, state):
   params = jax.tree.map(lambda x: x, state.params)
-  params["ap"]["out"]["bias"] = jnp.linspace(-3.0, 3.0, 18)
+  params["ap"]["out"]["bias"] = jnp.linspace(-3.0, 3.0, 21)
   actions, info = jax.jit(agent.act, static_argnums=3)(
     params, random_batch(7).observation_tm1, jax.random.key(0), False
   )

@@ -94,7 +94,7 @@ def test_outputs_have_the_declared_shapes(pixels: bool, objects: bool):
   assert tuple(params) == GROUPS
   phi = networks.features(params, seen)
   assert phi.shape == (4, 20)
-  assert networks.primitives(params, phi).shape == (4, 3, 6)
+  assert networks.primitives(params, phi).shape == (4, 3, 7)
   assert networks.alpha(params, phi).shape == (4,)
   assert networks.q_logits(params, phi, jnp.zeros((9, 4, 7))).shape == (9, 4, 11)
   prior = networks.prior(params, phi)
@@ -155,6 +155,7 @@ def test_prior_keeps_its_floors_and_limits():
   prior = prior_from_outputs(
     outputs,
     jnp.zeros((200, 3, 6)),
+    jnp.zeros((200, 3)),
     min_std=0.05,
     initial_std=0.2,
     max_std=0.5,
@@ -194,12 +195,18 @@ def test_a_limit_lets_the_gradient_back_in():
   np.testing.assert_array_equal(pull(-jnp.ones(5))[0], [-1, -1, -1, 0, 0])
 
 
-def test_prior_means_are_the_primitives_within_the_action_box():
+def test_prior_is_centred_on_the_primitives_within_the_action_box():
   networks = make_networks(CONFIG)
   seen = observation(4, pixels=False)
   params = networks.init(jax.random.key(0), seen)
-  params["ap"]["out"]["bias"] = jnp.linspace(-2.0, 2.0, 18)
+  params["ap"]["out"]["bias"] = jnp.linspace(-4.0, 4.0, 21)
   phi = networks.features(params, seen)
-  expected = np.clip(networks.primitives(params, phi), -1.0, 1.0)
-  np.testing.assert_array_equal(networks.prior(params, phi).mean, expected)
+  primitives = np.asarray(networks.primitives(params, phi))
+  expected = np.clip(primitives[..., :6], -1.0, 1.0)
+  prior = networks.prior(params, phi)
+  np.testing.assert_array_equal(prior.mean, expected)
   assert np.abs(expected).max() == 1.0
+  surest = np.log((1 - CONFIG.min_prob) / CONFIG.min_prob)
+  expected = np.clip(primitives[..., 6], -surest, surest)
+  np.testing.assert_allclose(prior.gripper_logits, expected, atol=0.02)
+  assert expected.max() == pytest.approx(surest)

@@ -39,9 +39,13 @@ def test_weighted_mean_counts_real_transitions_only():
   assert objectives.weighted_mean(losses, jnp.zeros(4)) == 0.0
 
 
-def test_ap_loss_is_the_mean_huber_loss():
-  predicted, label = random_array(0, 5, 3, 6), random_array(1, 5, 3, 6)
-  expected = special.huber(0.1, np.asarray(predicted - label)).mean((1, 2)) / 0.1
+def test_ap_loss_is_huber_of_velocities_and_cross_entropy_of_the_gripper():
+  predicted, label = random_array(0, 5, 3, 7), random_array(1, 5, 3, 7)
+  label = label.at[..., 6].set(label[..., 6] > 0)
+  error = np.asarray(predicted - label)[..., :6]
+  close = special.expit(np.asarray(predicted[..., 6], np.float64))
+  likelihood = np.where(label[..., 6] > 0, close, 1 - close)
+  expected = special.huber(0.1, error).mean((1, 2)) / 0.1 - np.log(likelihood).mean(1)
   ours = objectives.ap_loss(predicted, label, delta=0.1)
   np.testing.assert_allclose(ours, expected, rtol=1e-5)
 

@@ -22,6 +22,7 @@ from apnpql_jax.tasks.pinch import (
   TOLERANCE,
   Pinch,
   finger_angle,
+  grip,
   is_gripping,
   is_open,
   pick_and_place,
@@ -229,17 +230,18 @@ def test_pick_and_place_does_one_thing_in_each_case(withdraw):
   table = {case: rule[4:] for rule in RULES for case in itertools.product(*rule[:4])}
   assert len(table) == 16 == sum(np.prod([len(x) for x in rule[:4]]) for rule in RULES)
   cases = jnp.array(list(table))
-  primitives = np.random.default_rng(0).normal(size=(16, 3, 6)).astype(np.float32)
+  primitives = np.random.default_rng(0).normal(size=(16, 3, 7)).astype(np.float32)
   around, held, done, has_let_go = cases.T
   actions = pick_and_place(
     jnp.asarray(primitives),
-    around=around,
     held=held,
     done=done,
     is_open=has_let_go,
     withdraw=withdraw,
   )
+  commands = grip(around=around, held=held, done=done)
   for world, (row, close) in enumerate(table.values()):
     row = withdraw if row == 2 else row
-    np.testing.assert_array_equal(actions[world, :6], primitives[world, row])
-    assert actions[world, 6] == close
+    np.testing.assert_array_equal(actions[world], primitives[world, row])
+    assert commands[world, row] == close
+  np.testing.assert_array_equal(commands[:, 2], np.zeros(16))  # Neutral lets go.

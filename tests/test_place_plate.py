@@ -385,7 +385,7 @@ FUNNEL_WIDTH = FUNNEL - ALIGNED
 def test_object_target(task, resets, kinematics, neutral, shift, gap, twist, funnel):
   state = with_gap(task, resets, gap)
   hand = hand_at(task, state, kinematics, neutral, shift, twist)
-  positions, _ = task.tool_targets(state, hand)
+  positions, *_ = task.tool_targets(state, hand)
   height = RIM + GRASP + place_plate.HOVER * funnel
   expected = pos(task, state, "plate") + jnp.array([0.0, 0.0, height])
   np.testing.assert_allclose(positions[:, 0], expected, atol=1e-5)
@@ -400,7 +400,7 @@ def test_a_leaning_plate_is_gripped_at_its_highest_edge(
   tool = edge(task, state).at[:, 2].add(GRASP)
   turn = Rotation.from_euler("z", heading).as_matrix()
   hand = tool_at(task, kinematics, tool, turn @ neutral[1])
-  positions, rotations = task.tool_targets(state, hand)
+  positions, rotations, _ = task.tool_targets(state, hand)
   np.testing.assert_allclose(positions[:, 0], tool, atol=3e-5)
   # The hand is turned across the plate already, up to half a turn.
   closing = np.asarray(rotations[:, 0, :, 1]) @ (turn @ neutral[1])[:, 1]
@@ -412,7 +412,7 @@ def test_a_lying_plate_has_its_middle_as_target(task, resets, kinematics, steep)
   """It has no highest edge; what matters is that the target does not jump or break."""
   state = put(task, resets, "plate", turn=lying(steep))
   high = tool_at(task, kinematics, jnp.array([0.5, 0.0, 0.3]))
-  positions, rotations = task.tool_targets(state, high)
+  positions, rotations, _ = task.tool_targets(state, high)
   np.testing.assert_allclose(
     positions[:, 0, :2], pos(task, state, "plate")[:, :2], atol=1e-4
   )
@@ -437,7 +437,7 @@ def test_a_low_tool_that_is_away_rises(
   over = jnp.asarray(mocap(task, resets, "holder" if row == 0 else "goal")[0])
   tool = over.at[:, 0].add(off).at[:, 2].set(height)
   state = with_gap(task, resets, gap)
-  positions, _ = task.tool_targets(state, tool_at(task, kinematics, tool))
+  positions, *_ = task.tool_targets(state, tool_at(task, kinematics, tool))
   expected = tool if rises else over
   np.testing.assert_allclose(positions[:, row, :2], expected[:, :2], atol=1e-6)
   if rises or row == 1:
@@ -469,7 +469,7 @@ def test_a_held_plate_is_carried_into_the_box(
   start = goal + [0.0, away, RADIUS + height]
   state = with_gap(task, put(task, resets, "plate", start), THICKNESS)
   hand = hand_at(task, state, kinematics, neutral, (0.0, slip, 0.0))
-  positions, rotations = task.tool_targets(state, hand)
+  positions, rotations, _ = task.tool_targets(state, hand)
   step = positions[:, 1] - hand.site_xpos[:, task.scene.tool_site]
   expected = start + free * (goal - start)
   expected[:, 2] = RADIUS + 0.003 + place_plate.LIFT * far
@@ -483,7 +483,7 @@ def test_a_held_plate_is_carried_into_the_box(
 
 def test_an_empty_hand_goes_above_the_box(task, resets, kinematics):
   high = tool_at(task, kinematics, jnp.array([0.5, 0.0, 0.3]))
-  positions, rotations = task.tool_targets(resets, high)
+  positions, rotations, _ = task.tool_targets(resets, high)
   goal, frame = mocap(task, resets, "goal")
   expected = goal + [0.0, 0.0, place_plate.TRAVEL]
   np.testing.assert_allclose(positions[:, 1], expected, atol=1e-6)
@@ -492,7 +492,7 @@ def test_an_empty_hand_goes_above_the_box(task, resets, kinematics):
 
 
 def test_the_neutral_target_is_the_keyframe(task, resets, kinematics, neutral):
-  positions, rotations = task.tool_targets(resets, kinematics)
+  positions, rotations, _ = task.tool_targets(resets, kinematics)
   expected = np.broadcast_to(neutral[0], (WORLDS, 3))
   np.testing.assert_allclose(positions[:, 2], expected, atol=1e-5)
   expected = np.broadcast_to(neutral[1], (WORLDS, 3, 3))
@@ -544,7 +544,8 @@ def test_the_expert_picks_and_places(
   if place is not None:
     state = in_box(task, state, place)
   hand = hand_at(task, state, kinematics, neutral, (0.0, 0.0, lift))
-  primitives = jnp.arange(WORLDS * 18.0).reshape(WORLDS, 3, 6)
+  primitives = jnp.arange(WORLDS * 21.0).reshape(WORLDS, 3, 7)
   action = task.expert(state, hand, primitives)
-  np.testing.assert_array_equal(action[:, :6], primitives[:, row])
-  np.testing.assert_array_equal(action[:, 6], np.full(WORLDS, close))
+  np.testing.assert_array_equal(action, primitives[:, row])
+  commands = task.tool_targets(state, hand)[2]
+  np.testing.assert_array_equal(commands[:, row], np.full(WORLDS, close))

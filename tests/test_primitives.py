@@ -31,7 +31,7 @@ def test_bank_targets_reach_their_poses(task, small_bank):
   assert report.max_position_residual < ik.POSITION_TOLERANCE
   assert report.max_rotation_residual < ik.ROTATION_TOLERANCE
   state = _at(task, rows)
-  positions, rotations = task.tool_targets(
+  positions, rotations, _ = task.tool_targets(
     state, jax.jit(make_kinematics(task.scene))(state)
   )
   reached, turned, _ = arm.forward(arm.make_chain(task.scene), rows.targets)

@@ -31,7 +31,7 @@ def _example(pixels: int = 2) -> rb.Slot:
     reward=spec((), jnp.float32),
     terminated=spec((), jnp.bool_),
     truncated=spec((), jnp.bool_),
-    primitives=spec((3, 6), jnp.float32),
+    primitives=spec((3, 7), jnp.float32),
   )
   return rb.Slot(timestep=timestep, action=spec((7,), jnp.float32))
 
@@ -51,7 +51,7 @@ def _stream(steps: int, worlds: int, end_rate: float, seed: int) -> rb.Slot:
     reward=rng.normal(size=(steps, worlds)).astype(np.float32),
     terminated=terminated,
     truncated=end & ~terminated,
-    primitives=rng.normal(size=(steps, worlds, 3, 6)).astype(np.float32),
+    primitives=rng.normal(size=(steps, worlds, 3, 7)).astype(np.float32),
   )
   action = rng.normal(size=(steps, worlds, 7)).astype(np.float32)
   return rb.Slot(timestep=timestep, action=action)

@@ -303,7 +303,7 @@ FUNNEL_WIDTH = FUNNEL - ALIGNED
 def test_object_target(task, resets, kinematics, neutral, shift, gap, twist, funnel):
   state = with_gap(task, resets, gap)
   hand = hand_at(task, state, kinematics, neutral, shift, twist)
-  positions, _ = task.tool_targets(state, hand)
+  positions, *_ = task.tool_targets(state, hand)
   height = GRASP + stack_box.HOVER * funnel
   expected = pos(task, state, "yellow") + jnp.array([0.0, 0.0, height])
   np.testing.assert_allclose(positions[:, 0], expected, atol=1e-5)
@@ -327,7 +327,7 @@ def test_a_low_tool_that_is_away_rises(
   """By x, the boxes being further apart than that."""
   tool = pos(task, resets, body).at[:, 0].add(off).at[:, 2].set(height)
   state = with_gap(task, resets, gap)
-  positions, _ = task.tool_targets(state, tool_at(task, kinematics, tool))
+  positions, *_ = task.tool_targets(state, tool_at(task, kinematics, tool))
   over = tool if rises else pos(task, resets, body)
   np.testing.assert_allclose(positions[:, row, :2], over[:, :2], atol=1e-6)
   if rises or body == "blue":
@@ -336,7 +336,7 @@ def test_a_low_tool_that_is_away_rises(
 
 def test_an_empty_hand_goes_above_the_goal(task, resets, kinematics):
   high = tool_at(task, kinematics, jnp.array([0.5, 0.0, 0.3]))
-  positions, _ = task.tool_targets(resets, high)
+  positions, *_ = task.tool_targets(resets, high)
   blue = pos(task, resets, "blue")
   expected = blue.at[:, 2].set(stack_box.TRAVEL)
   np.testing.assert_allclose(positions[:, 1], expected, atol=1e-6)
@@ -361,7 +361,7 @@ def test_a_held_box_is_carried_onto_the_blue_one(
   state = put(task, resets, "yellow", blue + jnp.array(shift))
   state = with_gap(task, state, stack_box.SIDE)
   hand = hand_at(task, state, kinematics, neutral, (slip, 0.0, 0.0))
-  positions, _ = task.tool_targets(state, hand)
+  positions, *_ = task.tool_targets(state, hand)
   step = positions[:, 1] - hand.site_xpos[:, task.scene.tool_site]
   height = stack_box.SIDE + 0.001 + stack_box.LIFT * lift
   expected = blue + jnp.array([0.0, 0.0, height])
@@ -369,7 +369,7 @@ def test_a_held_box_is_carried_onto_the_blue_one(
 
 
 def test_the_neutral_target_is_the_keyframe(task, resets, kinematics, neutral):
-  positions, rotations = task.tool_targets(resets, kinematics)
+  positions, rotations, _ = task.tool_targets(resets, kinematics)
   expected = np.broadcast_to(neutral[0], (WORLDS, 3))
   np.testing.assert_allclose(positions[:, 2], expected, atol=1e-5)
   expected = np.broadcast_to(neutral[1], (WORLDS, 3, 3))
@@ -434,7 +434,8 @@ def test_the_expert_picks_and_places(
     resets = put(task, resets, "yellow", on_blue)
   state = with_gap(task, resets, gap)
   hand = hand_at(task, state, kinematics, neutral, (0.0, 0.0, lift))
-  primitives = jnp.arange(WORLDS * 18.0).reshape(WORLDS, 3, 6)
+  primitives = jnp.arange(WORLDS * 21.0).reshape(WORLDS, 3, 7)
   action = task.expert(state, hand, primitives)
-  np.testing.assert_array_equal(action[:, :6], primitives[:, row])
-  np.testing.assert_array_equal(action[:, 6], np.full(WORLDS, close))
+  np.testing.assert_array_equal(action, primitives[:, row])
+  commands = task.tool_targets(state, hand)[2]
+  np.testing.assert_array_equal(commands[:, row], np.full(WORLDS, close))

@@ -58,6 +58,7 @@ class World(struct.PyTreeNode):
   def timestep(self) -> TimeStep:
     velocity = (self.places - self.point[:, None]) / STEP
     size = jnp.max(jnp.abs(velocity), axis=-1, keepdims=True)
+    close = (self.holding | self.near(0))[:, None] & jnp.array([True, True, False])
     objects = (self.places[:, :2].reshape(WORLDS, -1), self.holding[:, None])
     return TimeStep(
       observation=Observation(
@@ -67,7 +68,9 @@ class World(struct.PyTreeNode):
       reward=self.success.astype(jnp.float32),
       terminated=self.success,
       truncated=(self.time >= LIMIT) & ~self.success,
-      primitives=velocity / jnp.maximum(size, 1.0),
+      primitives=jnp.concatenate(
+        [velocity / jnp.maximum(size, 1.0), close[..., None].astype(jnp.float32)], -1
+      ),
     )
 
 
@@ -109,11 +112,9 @@ def expert(world: World, key: Array) -> Array:
   """Follows one primitive after the other, with noise."""
   close = world.holding | world.near(0)
   towards = world.timestep.primitives
-  velocity = jnp.where(close[:, None], towards[:, 1], towards[:, 0])
-  velocity = velocity + 0.1 * jax.random.normal(key, velocity.shape)
-  return jnp.concatenate(
-    [jnp.clip(velocity, -1.0, 1.0), close[:, None].astype(jnp.float32)], axis=-1
-  )
+  action = jnp.where(close[:, None], towards[:, 1], towards[:, 0])
+  noise = 0.1 * jax.random.normal(key, (WORLDS, 6))
+  return action.at[:, :6].set(jnp.clip(action[:, :6] + noise, -1.0, 1.0))
 
 
 def agent(state: LearnerState, *, greedy: bool) -> Policy:
@@ -182,7 +183,7 @@ def test_expert_and_random_choice_frame_the_task():
   def random(world: World, key: Array) -> Array:
     arm, gripper = jax.random.split(key)
     choice = jax.random.randint(arm, (WORLDS,), 0, 3)
-    velocity = world.timestep.primitives[jnp.arange(WORLDS), choice]
+    velocity = world.timestep.primitives[jnp.arange(WORLDS), choice, :6]
     close = jax.random.bernoulli(gripper, 0.5, (WORLDS, 1)).astype(jnp.float32)
     return jnp.concatenate([velocity, close], axis=-1)
 

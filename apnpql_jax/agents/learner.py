@@ -190,6 +190,17 @@ def bellman_target(
   )
 
 
+def _ap_errors(predicted: Array, label: Array) -> Metrics:
+  """Mean error of the primitives' velocities, rad/s, and share of wrong gripper
+  commands, f32[*b] each."""
+  velocity = jnp.abs(predicted - label)[..., :-1]
+  wrong = (predicted[..., -1] > 0) != (label[..., -1] > 0)
+  return {
+    "ap/error": jnp.mean(velocity, axis=(-2, -1)),
+    "ap/gripper_error": jnp.mean(wrong, axis=-1),
+  }
+
+
 def total_loss(
   networks: Networks,
   algorithm: Algorithm,
@@ -221,7 +232,7 @@ def total_loss(
       prior, candidates.samples, weights, trained["nu"]
     ),
     "loss/nu": objectives.nu_loss(trained["nu"], entropy, epsilon_nu=config.epsilon_nu),
-    "ap/error": jnp.mean(jnp.abs(predicted - batch.primitives_tm1), axis=(-2, -1)),
+    **_ap_errors(predicted, batch.primitives_tm1),
     "npql/kl_over_eps": boltzmann.kl_to_prior(weights) / config.epsilon,
     "npql/ess": boltzmann.effective_sample_size(weights),
     "npql/alpha_mean": candidates.alpha,

@@ -22,7 +22,13 @@ from apnpql_jax.agents.encoder import Encoder
 from apnpql_jax.agents.prior import prior_from_outputs, prior_size
 from apnpql_jax.config import AgentConfig
 from apnpql_jax.dists import categorical, gmm
-from apnpql_jax.types import ARM_DOF, NUM_PRIMITIVES, Array, Observation
+from apnpql_jax.types import (
+  ACTION_DIM,
+  ARM_DOF,
+  NUM_PRIMITIVES,
+  Array,
+  Observation,
+)
 
 Params = dict[str, Any]
 
@@ -93,7 +99,7 @@ class Networks:
     phi = jnp.zeros((*batch, self.config.feature_dim))
     inputs: dict[str, tuple[Any, ...]] = dict.fromkeys(GROUPS, (phi,))
     inputs["encoder"] = (observation,)
-    inputs["z"] = (phi, jnp.zeros((1, *batch, ARM_DOF + 1)))
+    inputs["z"] = (phi, jnp.zeros((1, *batch, ACTION_DIM)))
     return {k: self.modules[k].init(keys[k], *inputs[k])["params"] for k in GROUPS}
 
   def features(self, params: Params, observation: Observation) -> Array:
@@ -101,13 +107,14 @@ class Networks:
     return self._apply("encoder", params, observation)
 
   def primitives(self, params: Params, phi: Array) -> Array:
-    """Predicted action primitives theta^ap, f32[*b, 3, 6] in rad/s, unbounded.
+    """Predicted action primitives theta^ap, f32[*b, 3, 7]: joint velocities in rad/s,
+    unbounded, and the logit of closing the gripper.
 
     The labels lie within [-1, 1], often on the border, where a squashed output
     would lose its gradient.
     """
     flat = self._apply("ap", params, phi)
-    return flat.reshape(*phi.shape[:-1], NUM_PRIMITIVES, ARM_DOF)
+    return flat.reshape(*phi.shape[:-1], NUM_PRIMITIVES, ACTION_DIM)
 
   def prior(self, params: Params, phi: Array) -> gmm.GripperGMM:
     """Behaviour prior b_theta; its gradient reaches the bp group alone.
@@ -116,10 +123,11 @@ class Networks:
     M-step trains what is left of theta and must move neither them nor phi.
     """
     phi = jax.lax.stop_gradient(phi)
-    mean = jax.lax.stop_gradient(jnp.clip(self.primitives(params, phi), -1.0, 1.0))
+    primitives = jax.lax.stop_gradient(self.primitives(params, phi))
     return prior_from_outputs(
       self._apply("bp", params, phi),
-      mean,
+      jnp.clip(primitives[..., :ARM_DOF], -1.0, 1.0),
+      primitives[..., ARM_DOF],
       min_std=self.config.min_std,
       initial_std=self.config.initial_std,
       max_std=self.config.max_std,
@@ -152,7 +160,7 @@ def make_networks(config: AgentConfig) -> Networks:
       (config.patch_channels, config.conv_channels),
       config.conv_overlap,
     ),
-    "ap": head(NUM_PRIMITIVES * ARM_DOF),
+    "ap": head(NUM_PRIMITIVES * ACTION_DIM),
     "bp": head(NUM_PRIMITIVES * per_component),
     "z": ValueHead(config.hidden, initial_logits),
     "alpha": head(1),

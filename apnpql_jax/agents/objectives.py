@@ -23,19 +23,23 @@ def weighted_mean(losses: Array, weight: Array) -> Array:
 def ap_loss(predicted: Array, label: Array, *, delta: float) -> Array:
   """Behaviour cloning of the action primitives, L^ap (paper Eq. 10).
 
-  Huber loss: quadratic below ``delta`` (rad/s), where the arm closes in on its
-  target, and linear above, where labels of distant targets saturate.
+  Velocities by a Huber loss: quadratic below ``delta`` (rad/s), where the arm closes in
+  on its target, and linear above, where labels of distant targets saturate. Gripper
+  commands by cross-entropy.
 
   Args:
-    predicted: f32[*b, 3, 6], rad/s.
-    label: f32[*b, 3, 6], rad/s.
+    predicted: f32[*b, 3, 7], velocities in rad/s and the logit of closing.
+    label: f32[*b, 3, 7], velocities in rad/s and the command in {0, 1}.
     delta: width of the quadratic part, rad/s.
 
   Returns:
-    f32[*b], mean over primitives and joints, in units of ``delta``.
+    f32[*b], mean over primitives and joints in units of ``delta``, plus the mean
+    cross-entropy over primitives in nats.
   """
-  huber = optax.losses.huber_loss(predicted, label, delta=delta) / delta
-  return jnp.mean(huber, axis=(-2, -1))
+  velocity, close = predicted[..., :-1], predicted[..., -1]
+  huber = optax.losses.huber_loss(velocity, label[..., :-1], delta=delta) / delta
+  entropy = optax.losses.sigmoid_binary_cross_entropy(close, label[..., -1])
+  return jnp.mean(huber, axis=(-2, -1)) + jnp.mean(entropy, axis=-1)
 
 
 def value_target(

@@ -15,6 +15,7 @@ from apnpql_jax.types import Array
 def prior_from_outputs(
   outputs: Array,
   mean: Array,
+  close: Array,
   *,
   min_std: float,
   initial_std: float,
@@ -38,6 +39,8 @@ def prior_from_outputs(
   Args:
     outputs: f32[*b, K * prior_size(D)].
     mean: f32[*b, K, D].
+    close: f32[*b, K], predicted logit of each primitive's closing the gripper, to which
+      an output is added.
     min_std: floor of the standard deviation of each joint, rad/s.
     initial_std: the standard deviation where the outputs are zero, rad/s.
     max_std: limit of the standard deviation of each joint, rad/s.
@@ -60,11 +63,12 @@ def prior_from_outputs(
   widest = 0.5 * math.log((1.0 - (num - 1) * min_prob) / min_prob)
   logits = one_way_clip(logits[..., 0], -widest, widest)
   surest = math.log((1.0 - min_prob) / min_prob)
+  close = jnp.clip(close, -surest, surest) + gripper[..., 0]
   return gmm.GripperGMM(
     logits=jax.nn.log_softmax(logits),
     mean=mean,
     scale_tril=jnp.exp(log_std)[..., None] / length * direction,
-    gripper_logits=one_way_clip(gripper[..., 0], -surest, surest),
+    gripper_logits=one_way_clip(close, -surest, surest),
   )
 
 

@@ -142,7 +142,7 @@ def _solve_targets(
   task, state, variant, pool, report: BankReport, advance
 ) -> ResetBank:
   kinematics = jax.jit(make_kinematics(task.scene))(state)
-  positions, rotations = map(np.asarray, task.tool_targets(state, kinematics))
+  positions, rotations, _ = map(np.asarray, task.tool_targets(state, kinematics))
   starts = np.asarray(state.qpos[:, task.scene.arm_qpos])
   chunks = [slice(i, i + CHUNK) for i in range(0, len(starts), CHUNK)]
   futures = [

@@ -130,7 +130,7 @@ class FlipCup(TableTask):
 
   def tool_targets(
     self, state: PhysicsState, kinematics: Kinematics
-  ) -> tuple[Array, Array]:
+  ) -> tuple[Array, Array, Array]:
     """See ``Task.tool_targets``."""
     tool = kinematics.site_xpos[:, self.scene.tool_site]
     cup, goal = self._cup_pos(state), state.mocap_pos[:, self._goal]
@@ -145,10 +145,10 @@ class FlipCup(TableTask):
     missing = tool - grasp
     along = (missing * reach).sum(-1, keepdims=True)
     off = geometry.norm(missing - along * reach)
-    off = off + pinch.LEVER * self._turned_away(kinematics, reach, roll)
+    off = off + pinch.off_by(self._turned_away(kinematics, reach, roll))
     back = geometry.funnel(off, aligned=pinch.ALIGNED, wide=pinch.FUNNEL)
-    stay = held | self._around(state, kinematics)
-    may_enter = stay | self._is_open(state)
+    around = self._around(state, kinematics)
+    may_enter = held | around | self._is_open(state)
     back = STANDOFF * jnp.where(may_enter, back, 1.0)[:, None]
     to_object = grasp - back * reach
 
@@ -173,7 +173,9 @@ class FlipCup(TableTask):
       _hand(heading, turn),
       jnp.broadcast_to(self._neutral_mat, (*roll.shape, 3, 3)),
     ]
-    return self.with_neutral(to_object, to_goal), jnp.stack(rotations, 1)
+    positions = self.with_neutral(to_object, to_goal)
+    close = pinch.grip(around=around, held=held, done=self._placed(state))
+    return positions, jnp.stack(rotations, 1), close
 
   def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:
     """The cup stands upright on the goal, at rest, and the gripper has let go."""
@@ -195,7 +197,6 @@ class FlipCup(TableTask):
     """Pick the cup, flip and place it; withdraw with what goes behind the goal."""
     return pinch.pick_and_place(
       primitives,
-      around=self._around(state, kinematics),
       held=self._held(state, kinematics),
       done=self._placed(state),
       is_open=self._is_open(state),

@@ -16,21 +16,24 @@ TOLERANCE = 0.004
 CLEARANCE = 0.02
 """m; an open hand leaves this much, both sides together."""
 
-NEAR = 0.01
-"""m; the hand may close when its pinch point is this close to where it shall grip."""
+NEAR = 0.015
+"""m; the hand may close when its pinch point is this close to where it shall grip. What
+stands freely is centred by the closing pads, and a policy that sees a pixel per
+centimetre hardly comes closer."""
 
 LOST = 0.025
 """m; what is further from the pinch point is not in the hand."""
 
-STRAIGHT = 0.1
-"""rad; the hand may close when it is turned away by less."""
-
+STRAIGHT = 0.25
+"""rad; the hand may close when it is turned away by less: the pads turn what stands
+freely."""
 
 ALIGNED, FUNNEL = 0.012, 0.05
 """m; the tool goes in fully within the first, stays out beyond the second."""
 
 LEVER = 0.05
-"""m/rad; how much a twist of the fingers counts as being off."""
+"""m/rad; how much a twist of the fingers beyond half of what is allowed counts as being
+off."""
 
 
 class Pinch:
@@ -48,6 +51,8 @@ class Pinch:
     above: float,
     hover: float,
     travel: float,
+    near: float = NEAR,
+    straight: float = STRAIGHT,
   ):
     """
     Args:
@@ -57,8 +62,11 @@ class Pinch:
       above: m, distance along the tool from where it is aimed at to the pads' centre.
       hover: m, height over the grasp at which the open finger tips clear the object.
       travel: m, tool height at which closed fingers clear everything.
+      near: m, see ``NEAR``.
+      straight: rad, see ``STRAIGHT``.
     """
     self._hover, self._travel = hover, travel
+    self._near, self._straight = near, straight
     self._scene, self._neutral_mat, self._width = scene, neutral_mat, width
     self.depth = float(pinch_height(width)) - above
     """m from the tool site back to the point that is aimed at what is gripped."""
@@ -101,7 +109,7 @@ class Pinch:
       f32[worlds, 3], m.
     """
     tool = kinematics.site_xpos[:, self._scene.tool_site]
-    off = geometry.norm(tool[:, :2] - aim[:, :2]) + LEVER * jnp.abs(twist)
+    off = geometry.norm(tool[:, :2] - aim[:, :2]) + off_by(twist, self._straight)
     height = geometry.funnel(off, aligned=ALIGNED, wide=FUNNEL)
     at_it = self.holds(state, kinematics, aim) | self.around(kinematics, aim, twist)
     height = self._hover * jnp.where(at_it | self.is_open(state), height, 1.0)
@@ -121,14 +129,33 @@ class Pinch:
 
   def around(self, kinematics: Kinematics, point: Array, twist: Array) -> Array:
     """bool[worlds]: where the hand may close to grip ``point`` (m)."""
-    near = geometry.norm(self.point(kinematics) - point) < NEAR
-    return near & (jnp.abs(twist) < STRAIGHT)
+    near = geometry.norm(self.point(kinematics) - point) < self._near
+    return near & (jnp.abs(twist) < self._straight)
+
+
+def off_by(twist: Array, straight: float = STRAIGHT) -> Array:
+  """How far off (m) a hand counts that is turned away by ``twist`` (rad)."""
+  return LEVER * jnp.maximum(jnp.abs(twist) - straight / 2, 0.0)
+
+
+def grip(*, around: Array, held: Array, done: Array) -> Array:
+  """Gripper commands f32[worlds, 3] of the primitives of such tasks.
+
+  The hand closes around the object, stays closed until the object is where it shall
+  be let go, and opens there; neutral is an open hand.
+
+  Args:
+    around: bool[worlds], the hand may close.
+    held: bool[worlds], the object is in the hand.
+    done: bool[worlds], the object is where it shall be let go.
+  """
+  close = (held | around) & ~done
+  return jnp.stack([close, close, jnp.zeros_like(close)], 1).astype(jnp.float32)
 
 
 def pick_and_place(
   primitives: Array,
   *,
-  around: Array,
   held: Array,
   done: Array,
   is_open: Array,
@@ -137,8 +164,7 @@ def pick_and_place(
   """Reach, close, carry, open, withdraw: the scripted expert of such tasks.
 
   Args:
-    primitives: f32[worlds, 3, 6], rad/s; object, goal, neutral.
-    around: bool[worlds], the hand may close.
+    primitives: f32[worlds, 3, 7]; object, goal, neutral.
     held: bool[worlds], the object is in the hand.
     done: bool[worlds], the object is where it shall be let go.
     is_open: bool[worlds], the hand has let go.
@@ -149,9 +175,7 @@ def pick_and_place(
   """
   # While the fingers open, stay with the object.
   choice = jnp.where(done, jnp.where(is_open, withdraw, 0), jnp.where(held, 1, 0))
-  velocity = jnp.take_along_axis(primitives, choice[:, None, None], axis=1)[:, 0]
-  close = (held | around) & ~done
-  return jnp.concatenate([velocity, close[:, None].astype(velocity.dtype)], -1)
+  return jnp.take_along_axis(primitives, choice[:, None, None], axis=1)[:, 0]
 
 
 def is_open(scene: Scene, state: PhysicsState, width: Array | float) -> Array:

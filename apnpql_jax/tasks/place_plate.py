@@ -22,7 +22,7 @@ import numpy as np
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.tasks import geometry
-from apnpql_jax.tasks.pinch import ALIGNED, FUNNEL, Pinch, pick_and_place
+from apnpql_jax.tasks.pinch import ALIGNED, FUNNEL, Pinch, grip, pick_and_place
 from apnpql_jax.tasks.table import TableTask
 from apnpql_jax.tasks.task import ResetDraw, register
 from apnpql_jax.types import Array
@@ -50,6 +50,10 @@ HOVER = 0.06
 
 TRAVEL = 0.22
 """m; tool height at which closed fingers clear the standing plate (135 mm)."""
+
+NEAR, STRAIGHT = 0.01, 0.12
+"""m and rad; closer than for what stands freely: the holder keeps the plate from being
+centred and turned by the pads."""
 
 LIFT = 0.085
 """m; how high the plate is carried, swinging: jaws and walls are 35 and 40 mm high."""
@@ -85,6 +89,8 @@ class PlacePlate(TableTask):
       above=0.0,
       hover=HOVER,
       travel=TRAVEL,
+      near=NEAR,
+      straight=STRAIGHT,
     )
 
   def sample_resets(self, rng: np.random.Generator, count: int) -> ResetDraw:
@@ -111,7 +117,7 @@ class PlacePlate(TableTask):
 
   def tool_targets(
     self, state: PhysicsState, kinematics: Kinematics
-  ) -> tuple[Array, Array]:
+  ) -> tuple[Array, Array, Array]:
     """See ``Task.tool_targets``."""
     tool = kinematics.site_xpos[:, self.scene.tool_site]
     plate, goal = self._plate_pos(state), state.mocap_pos[:, self._goal]
@@ -133,7 +139,12 @@ class PlacePlate(TableTask):
     # A plate that is still in its holder must not be turned.
     turn = jnp.where(held & (free < 1), self._plate_yaw(state), box_yaw)
     turns = jnp.stack([self._plate_yaw(state), turn, 0 * turn], 1)
-    return positions, geometry.turn_z(turns) @ self._neutral_mat
+    close = grip(
+      around=self._hand.around(kinematics, edge, twist),
+      held=held,
+      done=self._in_box(state),
+    )
+    return positions, geometry.turn_z(turns) @ self._neutral_mat, close
 
   def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:
     """The plate is in the box, on its floor, at rest, and the gripper has let go."""
@@ -155,12 +166,9 @@ class PlacePlate(TableTask):
     self, state: PhysicsState, kinematics: Kinematics, primitives: Array
   ) -> Array:
     """Pick the plate by its edge, place it in the box."""
-    edge = self._edge(state)
-    twist = self._hand.twist(kinematics, self._plate_yaw(state), np.pi)
     return pick_and_place(
       primitives,
-      around=self._hand.around(kinematics, edge, twist),
-      held=self._hand.holds(state, kinematics, edge),
+      held=self._hand.holds(state, kinematics, self._edge(state)),
       done=self._in_box(state),
       is_open=self._hand.is_open(state),
     )

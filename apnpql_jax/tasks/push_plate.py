@@ -9,9 +9,10 @@ Primitives, so that following one of them never knocks the plate over:
   above the goal.
 - neutral: the configuration of the keyframe.
 
-A tool that is low but outside the plate rises first. While dragging, the target is a
-waypoint at most ``LOOKAHEAD`` ahead, because a straight line in joint space bends
-away from one on the table by L^2 / 8r (1.2 mm for 0.07 m at 0.5 m).
+The fingers stay closed. A tool that is low but outside the plate rises first. While
+dragging, the target is a waypoint at most ``LOOKAHEAD`` ahead, because a straight
+line in joint space bends away from one on the table by L^2 / 8r (1.2 mm for 0.07 m at
+0.5 m).
 """
 
 from __future__ import annotations
@@ -96,7 +97,7 @@ class PushPlate(TableTask):
 
   def tool_targets(
     self, state: PhysicsState, kinematics: Kinematics
-  ) -> tuple[Array, Array]:
+  ) -> tuple[Array, Array, Array]:
     """See ``Task.tool_targets``."""
     tool = kinematics.site_xpos[:, self.scene.tool_site]
     plate, goal = self._plate_xy(state), self._goal_xy(state)
@@ -119,7 +120,8 @@ class PushPlate(TableTask):
     over_goal = jnp.where(above, geometry.up(goal, HOVER_HEIGHT), rise)
     to_goal = jnp.where(inside, geometry.up(tool[:, :2] + drag, DRAG_HEIGHT), over_goal)
     positions = self.with_neutral(to_object, to_goal)
-    return positions, jnp.broadcast_to(self._neutral_mat, (*positions.shape, 3))
+    rotations = jnp.broadcast_to(self._neutral_mat, (*positions.shape, 3))
+    return positions, rotations, jnp.ones(positions.shape[:2])
 
   def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:
     """The plate's centre is within 3 cm of the goal's, flat on the table, at rest."""
@@ -137,11 +139,10 @@ class PushPlate(TableTask):
   def expert(
     self, state: PhysicsState, kinematics: Kinematics, primitives: Array
   ) -> Array:
-    """Reach into the plate, then drag; the fingers stay closed."""
+    """Reach into the plate, then drag."""
     tool = kinematics.site_xpos[:, self.scene.tool_site]
     inside = self._inside(tool, self._plate_xy(state))[:, None]
-    velocity = jnp.where(inside, primitives[:, 1], primitives[:, 0])
-    return jnp.concatenate([velocity, jnp.ones_like(velocity[:, :1])], -1)
+    return jnp.where(inside, primitives[:, 1], primitives[:, 0])
 
   def _plate_xy(self, state: PhysicsState) -> Array:
     return state.qpos[:, self._plate : self._plate + 2]

@@ -20,7 +20,7 @@ import numpy as np
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.tasks import geometry
-from apnpql_jax.tasks.pinch import ALIGNED, FUNNEL, Pinch, pick_and_place
+from apnpql_jax.tasks.pinch import ALIGNED, FUNNEL, Pinch, grip, pick_and_place
 from apnpql_jax.tasks.table import TableTask
 from apnpql_jax.tasks.task import ResetDraw, register
 from apnpql_jax.types import Array
@@ -92,7 +92,7 @@ class StackBox(TableTask):
 
   def tool_targets(
     self, state: PhysicsState, kinematics: Kinematics
-  ) -> tuple[Array, Array]:
+  ) -> tuple[Array, Array, Array]:
     """See ``Task.tool_targets``."""
     yellow, blue = self._yellow_pos(state), self._blue_pos(state)
     yellow_yaw, blue_yaw = self._yaw(state, self._yellow), self._yaw(state, self._blue)
@@ -105,12 +105,17 @@ class StackBox(TableTask):
     )
     tool = kinematics.site_xpos[:, self.scene.tool_site]
     onto = tool + shift + geometry.up(0 * shift[:, :2], SIDE + 0.001 + LIFT * over)
-    held = self._hand.holds(state, kinematics, yellow)[:, None]
-    to_goal = jnp.where(held, onto, self._hand.above(kinematics, blue))
+    held = self._hand.holds(state, kinematics, yellow)
+    to_goal = jnp.where(held[:, None], onto, self._hand.above(kinematics, blue))
 
     positions = self.with_neutral(to_object, to_goal)
     turns = jnp.stack([yellow_yaw, blue_yaw, 0 * blue_yaw], 1)
-    return positions, geometry.turn_z(turns) @ self._neutral_mat
+    close = grip(
+      around=self._hand.around(kinematics, yellow, twist),
+      held=held,
+      done=self._placed(state),
+    )
+    return positions, geometry.turn_z(turns) @ self._neutral_mat, close
 
   def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:
     """Yellow stands on blue, both at rest, and the gripper has let go."""
@@ -141,14 +146,10 @@ class StackBox(TableTask):
     self, state: PhysicsState, kinematics: Kinematics, primitives: Array
   ) -> Array:
     """Pick the yellow box, place it on the blue one."""
-    yellow = self._yellow_pos(state)
-    heading = self._yaw(state, self._yellow)
-    twist = self._hand.twist(kinematics, heading, np.pi / 2)
     return pick_and_place(
       primitives,
-      around=self._hand.around(kinematics, yellow, twist),
-      held=self._hand.holds(state, kinematics, yellow),
-      done=self._stacked(state, STACKED_OFF / 2, STACKED_HEIGHT),
+      held=self._hand.holds(state, kinematics, self._yellow_pos(state)),
+      done=self._placed(state),
       is_open=self._hand.is_open(state),
     )
 
@@ -162,6 +163,10 @@ class StackBox(TableTask):
     """Heading of the box's face nearest to the world's x axis."""
     quat = state.qpos[:, address + 3 : address + 7]
     return geometry.fold(geometry.level_heading(quat), np.pi / 2)
+
+  def _placed(self, state: PhysicsState) -> Array:
+    """Well enough on the blue box to be let go."""
+    return self._stacked(state, STACKED_OFF / 2, STACKED_HEIGHT)
 
   def _stacked(self, state: PhysicsState, off: float, height: float) -> Array:
     shift = self._yellow_pos(state) - self._blue_pos(state)

@@ -41,12 +41,13 @@ class Task(Protocol):
 
   def tool_targets(
     self, state: PhysicsState, kinematics: Kinematics
-  ) -> tuple[Array, Array]:
-    """Where each action primitive wants the tool now.
+  ) -> tuple[Array, Array, Array]:
+    """Where each action primitive wants the tool now, and what of the gripper.
 
     Returns:
-      positions f32[worlds, 3, 3] and rotations f32[worlds, 3, 3, 3]; rows are
-      target object, desired goal and neutral configuration.
+      positions f32[worlds, 3, 3] (m), rotations f32[worlds, 3, 3, 3] and gripper
+      commands f32[worlds, 3] (1 closes); rows are target object, desired goal and
+      neutral configuration.
     """
     ...
 
@@ -61,7 +62,13 @@ class Task(Protocol):
   def expert(
     self, state: PhysicsState, kinematics: Kinematics, primitives: Array
   ) -> Array:
-    """f32[worlds, 7]: the scripted policy, a feedback on the privileged state."""
+    """f32[worlds, 7]: the scripted policy, a feedback on the privileged state.
+
+    Args:
+      state: [worlds, ...].
+      kinematics: [worlds, ...].
+      primitives: f32[worlds, 3, 7], the actions that follow each primitive.
+    """
     ...
 
 
