@@ -10,7 +10,7 @@ import numpy as np
 import optax
 import pytest
 
-from apnpql_jax.agents.algorithms import ALGORITHMS, get_algorithm
+from apnpql_jax.agents.algorithms import ALGORITHMS, algorithm_of
 from apnpql_jax.agents.learner import (
   bellman_target,
   make_agent,
@@ -98,7 +98,7 @@ TRAINS = {
 @pytest.mark.parametrize("name", TRAINS)
 def test_each_loss_trains_exactly_the_parameters_the_paper_names(agent, state, name):
   batch, networks = random_batch(1), agent.networks
-  algorithm = get_algorithm("ap_npql")
+  algorithm = algorithm_of("ap_npql")
   target = bellman_target(
     networks, algorithm, state.target_params, batch, jax.random.key(1)
   )
@@ -113,7 +113,7 @@ def test_each_loss_trains_exactly_the_parameters_the_paper_names(agent, state, n
 
 
 def test_total_loss_is_the_sum_of_the_losses(agent, state):
-  batch, algorithm = random_batch(1), get_algorithm("ap_npql")
+  batch, algorithm = random_batch(1), algorithm_of("ap_npql")
   target = jnp.full((BATCH, CONFIG.num_atoms), 1.0 / CONFIG.num_atoms)
   total, metrics = total_loss(
     agent.networks,
@@ -282,4 +282,4 @@ def test_unknown_algorithm_names_the_valid_ones():
   with pytest.raises(ConfigError, match="ap_npql"):
     make_agent(dataclasses.replace(CONFIG, algorithm="dqn"))
   with pytest.raises(ConfigError, match=", ".join(ALGORITHMS)):
-    get_algorithm("dqn")
+    algorithm_of("dqn")

@@ -15,13 +15,13 @@ from scipy import stats
 
 from apnpql_jax import memory, replay as rb
 from apnpql_jax.config import ConfigError
-from apnpql_jax.types import Observation, TimeStep, Transition
+from apnpql_jax.types import Observation, Slot, TimeStep, Transition
 
 GAMMA = 0.9
 WORLDS = 2
 
 
-def _example(pixels: int = 2) -> rb.Slot:
+def _example(pixels: int = 2) -> Slot:
   spec: Any = jax.ShapeDtypeStruct
   observation = Observation(
     robot=spec((2,), jnp.float32), global_image=spec((pixels, 3, 3), jnp.uint8)
@@ -33,10 +33,12 @@ def _example(pixels: int = 2) -> rb.Slot:
     truncated=spec((), jnp.bool_),
     primitives=spec((3, 6), jnp.float32),
   )
-  return rb.Slot(timestep=timestep, action=spec((7,), jnp.float32))
+  return Slot(
+    timestep=timestep, action=spec((7,), jnp.float32), log_prob=spec((), jnp.float32)
+  )
 
 
-def _stream(steps: int, worlds: int, end_rate: float, seed: int) -> rb.Slot:
+def _stream(steps: int, worlds: int, end_rate: float, seed: int) -> Slot:
   """Random slots [steps, worlds]; the robot state is the slot's (time, world)."""
   rng: Any = np.random.default_rng(seed)
   end: Any = rng.random((steps, worlds)) < end_rate
@@ -54,14 +56,15 @@ def _stream(steps: int, worlds: int, end_rate: float, seed: int) -> rb.Slot:
     primitives=rng.normal(size=(steps, worlds, 3, 6)).astype(np.float32),
   )
   action = rng.normal(size=(steps, worlds, 7)).astype(np.float32)
-  return rb.Slot(timestep=timestep, action=action)
+  log_prob = rng.normal(size=(steps, worlds)).astype(np.float32)
+  return Slot(timestep=timestep, action=action, log_prob=log_prob)
 
 
 def _image(observation: Observation) -> Any:
   return observation.global_image
 
 
-def _fill(stream: rb.Slot, length: int, chunk: int) -> rb.Replay:
+def _fill(stream: Slot, length: int, chunk: int) -> rb.Replay:
   steps, worlds = stream.action.shape[:2]
   add = jax.jit(rb.add, donate_argnums=0)
   replay = rb.create(_example(), length, worlds)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from apnpql_jax import replay
 from apnpql_jax.agents.learner import LearnerState, make_agent
 from apnpql_jax.config import AgentConfig
-from apnpql_jax.types import Array, Observation, TimeStep
+from apnpql_jax.types import Array, Observation, Slot, TimeStep
 
 WORLDS = 32
 LIMIT = 10
