@@ -12,7 +12,7 @@ from apnpql_jax.agents.networks import Heads
 from apnpql_jax.dists import boltzmann
 from apnpql_jax.dists.action import ActionDistribution
 from apnpql_jax.dists.gmm import GripperGMM
-from apnpql_jax.types import Array
+from apnpql_jax.types import ARM_DOF, Array
 
 CEM_ITERATIONS = 2
 CEM_SAMPLES = 64
@@ -44,9 +44,10 @@ class Candidates(struct.PyTreeNode):
 
     Of q it is an estimate: log b + Q / alpha - log mean_i exp(Q_i / alpha).
     """
-    log_mean = jax.nn.logsumexp(self.tilt * self.q_values, axis=0)
-    log_mean = log_mean - math.log(self.q_values.shape[0])
-    return self.base.log_prob(actions) + self.tilt * q_values - log_mean
+    tilt = self.tilt[None]
+    log_sum = jax.nn.logsumexp(tilt * self.q_values, axis=0, keepdims=True)
+    log_mean = log_sum - math.log(self.q_values.shape[0])
+    return self.base.log_prob(actions) + tilt * q_values - log_mean
 
 
 def clip_action(actions: Array) -> Array:
@@ -146,10 +147,12 @@ def _refit(samples: Array, q_values: Array, min_prob: float) -> GripperGMM:
   best = clip_action(jnp.take_along_axis(samples, elites, axis=0))
   mean, std = jnp.mean(best, axis=0), jnp.std(best, axis=0)
   close = jnp.clip(mean[..., -1], min_prob, 1.0 - min_prob)
-  std = jnp.maximum(std[..., :-1], CEM_MIN_STD)
+  joint = jnp.arange(ARM_DOF)
+  scale = jnp.zeros((*close.shape, 1, ARM_DOF, ARM_DOF))
+  std = jnp.maximum(std[..., None, :-1], CEM_MIN_STD)
   return GripperGMM(
     logits=jnp.zeros((*close.shape, 1)),
     mean=mean[..., None, :-1],
-    scale_tril=(std[..., None] * jnp.eye(std.shape[-1]))[..., None, :, :],
+    scale_tril=scale.at[..., joint, joint].set(std),
     gripper_logits=(jnp.log(close) - jnp.log1p(-close))[..., None],
   )

@@ -76,7 +76,7 @@ def fit_advantageous(
   policy = policies.parametric(
     heads, prior, key, num_samples=heads.config.policy_samples
   )
-  good = heads.q(samples) >= policy.value
+  good = heads.q(samples) >= policy.value[None]
   return _fit(heads, prior, samples, good.astype(samples.dtype), nu)
 
 
