@@ -26,9 +26,6 @@ class KnownValues(Heads):
 
   goal: float = 0.5
 
-  def frozen(self) -> KnownValues:
-    return dataclasses.replace(super().frozen(), goal=self.goal)
-
   def z(self, actions):
     far = jnp.sum(jnp.square(actions[..., :6] - self.goal), axis=-1)
     return (1.0 - far + 0.5 * actions[..., 6])[..., None]

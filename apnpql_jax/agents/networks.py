@@ -78,7 +78,7 @@ class Heads:
   def frozen(self) -> Heads:
     """The same predictions; no gradient reaches the parameters."""
     params, phi = jax.lax.stop_gradient((self.params, self.phi))
-    return Heads(self.networks, params, phi)
+    return dataclasses.replace(self, params=params, phi=phi)
 
   def primitives(self) -> Array:
     """Predicted action primitives theta^ap, f32[*b, 3, 6] in rad/s, unbounded.
