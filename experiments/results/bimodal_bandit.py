@@ -31,19 +31,18 @@ PRIMITIVES = ((0.4, 0.4), (-0.4, -0.4), (0.0, 0.0))
 """Labels of the action primitives: the right ways, but not the right speed."""
 
 ALGORITHMS = ("ap_npql", "ap_mpo", "ap_sac")
-BATCH = 128
+BATCH = 64
 CONFIG = AgentConfig(
-  hidden=(64, 64),
+  hidden=(32, 32),
   feature_dim=16,
   num_atoms=21,
-  learning_rate_e=1e-3,
-  learning_rate_m=1e-3,
-  learning_rate_alpha=1e-3,
+  learning_rate_e=3e-3,
+  learning_rate_m=3e-4,
+  learning_rate_alpha=3e-3,
   epsilon=1.5,
-  epsilon_nu=-4.0,
-  target_samples=10,
-  initial_std=0.3,
-  max_std=0.5,
+  target_samples=8,
+  policy_samples=48,
+  initial_std=0.25,
 )
 
 
@@ -125,6 +124,7 @@ def draw(actions: dict[str, np.ndarray], path: Path) -> None:
     )
     ax.set_xlabel("joint 1, rad/s")
     ax.set_aspect("equal")
+    ax.set_xticks(np.linspace(-1.0, 1.0, 5))
   axes[0].set_ylabel("joint 2, rad/s")
   figure.savefig(path, dpi=110)
 
@@ -132,7 +132,7 @@ def draw(actions: dict[str, np.ndarray], path: Path) -> None:
 def main() -> None:
   """Trains the three and draws what they do."""
   actions = {
-    name: play(dataclasses.replace(CONFIG, algorithm=name), updates=4000, draws=1500)
+    name: play(dataclasses.replace(CONFIG, algorithm=name), updates=2000, draws=1000)
     for name in ALGORITHMS
   }
   draw(actions, Path(__file__).with_suffix(".png"))
