@@ -4,8 +4,8 @@
 
 Writes bimodal_bandit.png beside this file. Reward is 1 where the first two joints move
 together at 0.6 rad/s, one way or the other, and falls off around. Three algorithms see
-the same uniformly random actions and share prior, limit and value network; they differ
-in the policy alone, as in Table I of the paper.
+the same uniformly random actions and share prior, limit and value network. The prior is
+held still, so that they differ in the policy alone, as in Table I of the paper.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ CONFIG = AgentConfig(
   feature_dim=16,
   num_atoms=21,
   learning_rate_e=3e-3,
-  learning_rate_m=3e-4,
+  learning_rate_m=0.0,
   learning_rate_alpha=3e-3,
   epsilon=1.5,
   target_samples=8,
