@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 from batches import random_batch
 import jax
@@ -35,7 +36,7 @@ def test_retrace_target_matches_rlax():
   )
   q_tm1 = random_array(5, BATCH, N)  # Only the first one counts, and cancels.
   q_tm1 = q_tm1.at[:, 1:].set(q[:, :-1])
-  error = jax.vmap(rlax.retrace_continuous, (0, 0, 0, 0, 0, 0, None))(
+  error: Any = jax.vmap(rlax.retrace_continuous, (0, 0, 0, 0, 0, 0, None))(
     q_tm1, q[:, :-1], value, reward, discount, ratio[:, :-1], 1.0
   )
   np.testing.assert_allclose(ours, error[:, 0] + q_tm1[:, 0], rtol=1e-4, atol=1e-5)

@@ -79,14 +79,15 @@ def test_cross_entropy_method_comes_nearer_than_its_first_draw(heads):
 
 def test_uniform_box_is_uniform():
   box = UniformBox((2,), 6)
-  draws = np.asarray(box.sample(jax.random.key(0), 20_000))
+  drawn = box.sample(jax.random.key(0), 20_000)
+  draws = np.asarray(drawn)
   assert draws.shape == (20_000, 2, 7)
   np.testing.assert_allclose(draws[..., :6].mean((0, 1)), 0.0, atol=0.02)
   np.testing.assert_allclose(draws[..., :6].var((0, 1)), 1.0 / 3.0, atol=0.01)
   assert set(np.unique(draws[..., 6])) == {0.0, 1.0}
   assert draws[..., 6].mean() == pytest.approx(0.5, abs=0.01)
   # 64 for the arm, two commands: the density integrates to one.
-  assert np.exp(box.log_prob(draws[:1])) * 2.0**7 == pytest.approx(1.0, rel=1e-5)
+  assert np.exp(box.log_prob(drawn[:1])) * 2.0**7 == pytest.approx(1.0, rel=1e-5)
   np.testing.assert_allclose(box.entropy_bound(), 7.0 * np.log(2.0), rtol=1e-6)
 
 

@@ -12,13 +12,17 @@ from apnpql_jax.dists import boltzmann, categorical
 
 SAMPLES, BATCH, BINS = 12, 3, 11
 ATOMS = categorical.support(v_min=-1.0, v_max=2.0, num_atoms=BINS)
-FINITE = {"allow_nan": False, "width": 32}
+
+
+def number(low: float, high: float) -> st.SearchStrategy[float]:
+  """A float that f32 holds exactly."""
+  return st.floats(low, high, allow_nan=False, width=32)
 
 
 def arrays(*shape: int, low: float, high: float) -> st.SearchStrategy[np.ndarray]:
   """f32 of the shape, every entry drawn by itself."""
   size = int(np.prod(shape))
-  numbers = st.lists(st.floats(low, high, **FINITE), min_size=size, max_size=size)
+  numbers = st.lists(number(low, high), min_size=size, max_size=size)
   return numbers.map(lambda x: np.array(x, np.float32).reshape(shape))
 
 
@@ -29,7 +33,7 @@ kl_to_prior = jax.jit(boltzmann.kl_to_prior)
 
 
 @settings(max_examples=60, deadline=None)
-@given(q=Q, alpha=ALPHA, shift=st.floats(-8.0, 8.0, **FINITE))
+@given(q=Q, alpha=ALPHA, shift=number(-8.0, 8.0))
 def test_weights_are_a_distribution_that_no_shift_changes(q, alpha, shift):
   weights = weigh(q, alpha)
   np.testing.assert_allclose(weights.sum(0), 1.0, rtol=1e-5)
@@ -59,7 +63,7 @@ def test_a_colder_policy_is_farther_from_the_prior_and_worth_more(q, alpha):
   discount=arrays(BATCH, low=0.0, high=1.0),
 )
 def test_projection_keeps_mass_and_the_clipped_mean(logits, reward, discount):
-  probs = np.asarray(jax.nn.softmax(logits))
+  probs = jax.nn.softmax(logits)
   projected = categorical.project(
     probs, jnp.asarray(reward), jnp.asarray(discount), ATOMS
   )

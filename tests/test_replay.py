@@ -156,14 +156,15 @@ def test_no_transition_leaves_its_episode(n_step: int):
 def test_windows_are_the_slots_after_the_start_across_the_seam():
   stream = _stream(48, WORLDS, 0.2, seed=4)
   replay = _fill(stream, length=32, chunk=16)  # Newest and oldest slot are neighbours.
-  key, settings_ = jax.random.key(0), {"batch_size": 64, "n_step": 4, "gamma": GAMMA}
-  batch = jax.device_get(rb.sample(replay, key, windows=True, **settings_))
+  draw = functools.partial(rb.sample, replay, jax.random.key(0))
+  draw = functools.partial(draw, batch_size=64, n_step=4, gamma=GAMMA)
+  batch = jax.device_get(draw(windows=True))
   t, w = batch.observation_tm1.robot.astype(int).T
   after = t[:, None] + np.arange(1, 5)
   expected = jax.tree.map(lambda x: x[after, w[:, None]], stream)
   jax.tree.map(np.testing.assert_array_equal, batch.window, expected)
   # Nothing else is drawn otherwise.
-  without = jax.device_get(rb.sample(replay, key, **settings_))
+  without = jax.device_get(draw())
   assert without.window is None
   jax.tree.map(np.testing.assert_array_equal, without, batch.replace(window=None))
 

@@ -46,7 +46,7 @@ CONFIG = AgentConfig(
 )
 
 
-def reward(actions: Array) -> Array:
+def reward(actions: Array | np.ndarray) -> Array:
   """f32[*b, 7] -> f32[*b] within [0, 1]."""
   distance = jnp.square(actions[..., None, :2] - jnp.array(PEAKS)).sum(-1)
   return jnp.exp(-0.5 * distance / WIDTH**2).max(-1)
@@ -115,7 +115,7 @@ def draw(actions: dict[str, np.ndarray], path: Path) -> None:
     1, len(actions), figsize=(4 * len(actions), 4.3), sharey=True, layout="constrained"
   )
   for ax, (name, drawn) in zip(axes, actions.items(), strict=True):
-    ax.contourf(axis, axis, reward(jnp.asarray(grid)), levels=12, cmap="Greys")
+    ax.contourf(axis, axis, reward(grid), levels=12, cmap="Greys")
     ax.plot(*drawn[:, :2].T, "o", ms=2.5, alpha=0.35, color="tab:blue", mew=0)
     peak = nearest(drawn)
     ax.set_title(
