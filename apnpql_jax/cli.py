@@ -170,7 +170,7 @@ def _check_registered(config: TrainConfig) -> None:
   validate(
     config,
     tasks=tasks.task_names(),
-    algorithms=tuple(algorithms.ALGORITHMS),
+    algorithms=algorithms.epsilon_is_bounded(),
     memory_bytes=memory.available_memory(),
   )
 

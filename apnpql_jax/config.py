@@ -66,7 +66,8 @@ class AgentConfig:
   """Rewards summed before the value target bootstraps."""
 
   learning_rate_e: float = 3e-4
-  """Adam rate of the E-step: features, action primitives, value."""
+  """Adam rate of the E-step: features, action primitives, value; also of the
+  parametric policy, where there is one."""
 
   learning_rate_m: float = 3e-4
   """Adam rate of the M-step: the parametric prior."""
@@ -99,7 +100,26 @@ class AgentConfig:
   """Largest return the value distribution can express."""
 
   epsilon: float = 1.0
-  """Limit of KL(q || prior) in nats; below log of the number of candidates."""
+  """Limit of the KL from the policy to the prior in nats; below log of the number of
+  candidates where these are weighed. With a uniform prior and a reverse KL (sac) it is
+  a floor on the entropy of the policy, 4.85 - epsilon."""
+
+  temperature: str = "state"
+  """How the limit is kept: an alpha for each state, one shared by all states (the limit
+  then holds on average), or fixed at initial_alpha (the limit is not kept)."""
+
+  regulariser: str = "row"
+  """What the policy is kept close to: row (as in Table I) or uniform (no prior)."""
+
+  policy_evaluation: str = "row"
+  """How values are learnt: row (as in Table I), categorical, td0, retrace or
+  clipped_double_q. TD(0) proper has n_step 1."""
+
+  prior_mean: str = "primitives"
+  """Means of the prior: primitives (predicted), or learned by the M-step."""
+
+  diagonal_covariance: bool = False
+  """Prior and policy move each joint by itself."""
 
   epsilon_nu: float = 0.0
   """Entropy floor of the prior in nats."""
@@ -137,6 +157,18 @@ class AgentConfig:
 
   max_std: float = 0.3
   """Limit of the prior's standard deviation of each joint, rad/s."""
+
+  policy_min_std: float = 0.01
+  """Floor of the parametric policy's standard deviation of each joint, rad/s."""
+
+  policy_initial_std: float = 0.3
+  """The parametric policy's standard deviation of each joint before training, rad/s."""
+
+  policy_max_std: float = 1.0
+  """Limit of the parametric policy's standard deviation of each joint, rad/s."""
+
+  policy_min_prob: float = 0.001
+  """Smallest probability of a gripper command in the parametric policy."""
 
   min_prob: float = 0.05
   """Smallest probability of a gripper command in the prior, and weight of a component

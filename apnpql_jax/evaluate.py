@@ -48,7 +48,7 @@ def make_player(env: Env, make_policy: Callable[[Any], Policy]) -> Player:
     def period(carry):
       state, outcome, running, key = carry
       key, policy_key, env_key = jax.random.split(key, 3)
-      state = env.step(state, policy(state, policy_key), env_key)
+      state = env.step(state, policy(state, policy_key)[0], env_key)
       solved = running & state.timestep.terminated
       outcome = Episodes(outcome.success | solved, outcome.length + running)
       return state, outcome, running & ~state.timestep.last, key

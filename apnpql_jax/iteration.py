@@ -14,9 +14,9 @@ from apnpql_jax import replay
 from apnpql_jax.agents.learner import Agent, LearnerState
 from apnpql_jax.config import TrainConfig
 from apnpql_jax.env import Env, EnvState
-from apnpql_jax.replay import Replay, Slot
+from apnpql_jax.replay import Replay
 from apnpql_jax.rollout import agent_policy, expert_policy, rollout
-from apnpql_jax.types import ACTION_DIM, Array, Metrics
+from apnpql_jax.types import ACTION_DIM, Array, Metrics, Slot
 
 
 class TrainState(struct.PyTreeNode):
@@ -44,6 +44,7 @@ def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
     expert_share=config.replay.expert_share,
     n_step=config.agent.n_step,
     gamma=config.agent.gamma,
+    windows=agent.networks.evaluation.windows,
   )
 
   def iteration(state: TrainState) -> tuple[TrainState, Metrics]:
@@ -102,10 +103,11 @@ def initial_state(config: TrainConfig, env: Env, agent: Agent) -> TrainState:
 def example_slot(worlds: EnvState) -> Slot:
   """Shapes and dtypes of one replay slot of one world."""
   action: Any = jax.ShapeDtypeStruct((ACTION_DIM,), jnp.float32)
+  log_prob: Any = jax.ShapeDtypeStruct((), jnp.float32)
   timestep = jax.tree.map(
     lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), worlds.timestep
   )
-  return Slot(timestep=timestep, action=action)
+  return Slot(timestep=timestep, action=action, log_prob=log_prob)
 
 
 def collect_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:

@@ -75,7 +75,7 @@ def _play(
   def period(carry, key):
     state, running = carry
     policy_key, env_key = jax.random.split(key)
-    moved = env.step(state, policy(state, policy_key), env_key)
+    moved = env.step(state, policy(state, policy_key)[0], env_key)
     running = running & ~state.timestep.last
     solved = running & moved.timestep.terminated
     return (moved, running), (state.physics, running, solved)

@@ -8,6 +8,7 @@ so that no frame is stored twice and N can change without collecting again.
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
@@ -16,17 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax.types import Array, TimeStep, Transition
+from apnpql_jax.types import Array, Slot, Transition
 
 _CANDIDATES = 4
 """Starts drawn per row; those where an episode ended (1 in 20 to 94) are refused."""
-
-
-class Slot(struct.PyTreeNode):
-  """One instant of one world and what was done there."""
-
-  timestep: TimeStep  # [*b, ...]
-  action: Array  # f32[*b, 7]: action_t; ignored where the step is last
 
 
 class Replay(struct.PyTreeNode):
@@ -93,7 +87,13 @@ def can_sample(replay: Replay, *, n_step: int) -> Array:
 
 
 def sample(
-  replay: Replay, key: Array, *, batch_size: int, n_step: int, gamma: float
+  replay: Replay,
+  key: Array,
+  *,
+  batch_size: int,
+  n_step: int,
+  gamma: float,
+  windows: bool = False,
 ) -> Transition:
   """Draws N-step transitions uniformly, with replacement, over all valid starts.
 
@@ -107,6 +107,8 @@ def sample(
     batch_size: transitions B.
     n_step: N, at least 1.
     gamma: discount per control period.
+    windows: also return all N instants after the start, past an end of the episode
+      too; without it ``Transition.window`` is None.
 
   Returns:
     Transition [B, ...], weights zero where ``can_sample`` denies the ring and where
@@ -130,6 +132,7 @@ def sample(
     observation_t=_gather(timestep.observation, (time + stop + 1) % length, world),
     primitives_tm1=_gather(timestep.primitives, time, world),
     weight=valid.astype(reward.dtype),
+    window=_gather(replay.slots, window, world[:, None]) if windows else None,
   )
 
 
@@ -149,6 +152,7 @@ def sample_mixed(
   expert_share: float,
   n_step: int,
   gamma: float,
+  windows: bool = False,
 ) -> Transition:
   """``sample`` of both replays: agent rows first, then ``expert_count`` expert rows.
 
@@ -160,8 +164,9 @@ def sample_mixed(
   if from_expert and expert_replay is None:
     raise ValueError(f"expert_share {expert_share} needs an expert replay")
   counts = ((agent_replay, batch_size - from_expert), (expert_replay, from_expert))
+  draw = functools.partial(sample, n_step=n_step, gamma=gamma, windows=windows)
   parts = [
-    sample(replay, part_key, batch_size=count, n_step=n_step, gamma=gamma)
+    draw(replay, part_key, batch_size=count)
     for (replay, count), part_key in zip(counts, jax.random.split(key), strict=True)
     if replay is not None and count
   ]

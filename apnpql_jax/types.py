@@ -49,6 +49,14 @@ class TimeStep(struct.PyTreeNode):
     return self.terminated | self.truncated
 
 
+class Slot(struct.PyTreeNode):
+  """One instant of one world and what was done there."""
+
+  timestep: TimeStep  # [*b, ...]
+  action: Array  # f32[*b, 7]: action_t, as executed; ignored where the step is last
+  log_prob: Array  # f32[*b]: of action_t under the policy that acted
+
+
 class Transition(struct.PyTreeNode):
   """An N-step transition as the learner consumes it."""
 
@@ -59,3 +67,4 @@ class Transition(struct.PyTreeNode):
   observation_t: Observation  # [B, ...]: state to bootstrap from
   primitives_tm1: Array  # f32[B, 3, 7]: labels of the action primitives
   weight: Array  # f32[B]: one where the transition is real, zero where it is not
+  window: Slot | None = None  # [B, N, ...]: the instants 1 to N after _tm1

@@ -1,12 +1,12 @@
 """What a configuration must satisfy, checked before anything is built.
 
-Knows no task and no algorithm: their valid names are handed in, so that reading a
+Knows no task and no algorithm: what is valid is handed in, so that reading a
 configuration never imports the simulator or the learner.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import math
 from typing import TYPE_CHECKING
 
@@ -18,23 +18,29 @@ if TYPE_CHECKING:
 
 BACKENDS = ("auto", "mjx", "native")
 OBSERVATIONS = ("pixels", "state")
+TEMPERATURES = ("state", "shared", "fixed")
+REGULARISERS = ("row", "uniform")
+EVALUATIONS = ("row", "categorical", "td0", "retrace", "clipped_double_q")
+PRIOR_MEANS = ("primitives", "learned")
 
 MIN_BANK_ROWS = 16
 
 _PIXEL_BYTES = 3 * (72 * 96 + 36 * 64)
-_OTHER_BYTES = 4 * (21 + 3 + 7 + 21 + 1) + 2
-"""Robot state, tool, action, primitive labels, reward (f32) and the two end flags."""
+_OTHER_BYTES = 4 * (21 + 3 + 7 + 21 + 2) + 2
+"""Robot state, tool, action, primitive labels, reward, log density of the action (f32)
+and the two end flags."""
 
 _POSITIVE = (
   "env.worlds env.time_limit_s env.control_period_s env.bank_rows "
-  "agent.n_step agent.learning_rate_e agent.learning_rate_m "
-  "agent.learning_rate_alpha agent.learning_rate_nu agent.epsilon "
+  "agent.n_step agent.learning_rate_e agent.epsilon "
   "agent.feature_dim agent.max_grad_norm agent.patch_channels agent.conv_channels "
-  "agent.ap_delta agent.min_std agent.initial_alpha agent.min_alpha "
+  "agent.ap_delta agent.min_std agent.policy_min_std "
+  "agent.initial_alpha agent.min_alpha "
   "replay.capacity replay.batch_size total_steps rollout_length "
   "updates_per_iteration eval_every eval_episodes checkpoint_every keep_checkpoints"
 ).split()
 _NOT_NEGATIVE = (
+  "agent.learning_rate_m agent.learning_rate_alpha agent.learning_rate_nu "
   "agent.lambda_ap agent.m_step_delay replay.expert_steps replay.expert_noise seed"
 ).split()
 
@@ -43,7 +49,7 @@ def validate(
   config: TrainConfig,
   *,
   tasks: Sequence[str] | None = None,
-  algorithms: Sequence[str] | None = None,
+  algorithms: Mapping[str, bool] | None = None,
   memory_bytes: int | None = None,
 ) -> None:
   """Refuses a configuration that cannot work, before anything is built.
@@ -51,7 +57,8 @@ def validate(
   Args:
     config: what to check.
     tasks: valid task names; not checked if None.
-    algorithms: valid algorithm names; not checked if None.
+    algorithms: valid algorithm names, with True where candidates are weighed, so that
+      they bound epsilon; not checked if None.
     memory_bytes: memory the replays must fit into; not checked if None.
 
   Raises:
@@ -63,8 +70,10 @@ def validate(
   if tasks is not None:
     check_name("env.task", config.env.task, tasks)
   if algorithms is not None:
-    check_name("agent.algorithm", config.agent.algorithm, algorithms)
+    check_name("agent.algorithm", config.agent.algorithm, tuple(algorithms))
   _validate_agent(config.agent)
+  if algorithms is not None and algorithms[config.agent.algorithm]:
+    _validate_epsilon(config.agent)
   _validate_replay(config, memory_bytes)
 
 
@@ -106,6 +115,10 @@ def _validate_ranges(config: TrainConfig) -> None:
 
 
 def _validate_agent(agent: AgentConfig) -> None:
+  check_name("agent.temperature", agent.temperature, TEMPERATURES)
+  check_name("agent.regulariser", agent.regulariser, REGULARISERS)
+  check_name("agent.policy_evaluation", agent.policy_evaluation, EVALUATIONS)
+  check_name("agent.prior_mean", agent.prior_mean, PRIOR_MEANS)
   for name in ("gamma", "target_rate"):
     if not 0.0 < getattr(agent, name) <= 1.0:
       raise ConfigError(f"agent.{name}={getattr(agent, name)} must be within (0, 1]")
@@ -118,18 +131,29 @@ def _validate_agent(agent: AgentConfig) -> None:
     )
   if not agent.hidden or min(agent.hidden) < 1 or max(agent.hidden) >= 2**31:
     raise ConfigError(f"agent.hidden={agent.hidden} must be positive layer widths")
-  if not agent.min_std < agent.initial_std < agent.max_std:
-    raise ConfigError(
-      f"agent.initial_std={agent.initial_std} must lie between agent.min_std="
-      f"{agent.min_std} and agent.max_std={agent.max_std}"
+  for kind in ("", "policy_"):
+    low, start, high = (
+      getattr(agent, f"{kind}{name}") for name in ("min_std", "initial_std", "max_std")
     )
+    if not low < start < high:
+      raise ConfigError(
+        f"agent.{kind}initial_std={start} must lie between agent.{kind}min_std={low} "
+        f"and agent.{kind}max_std={high}"
+      )
   if not 0.0 < agent.min_prob < 1.0 / 3.0:
     raise ConfigError(f"agent.min_prob={agent.min_prob} must be within (0, 1/3)")
+  if not 0.0 < agent.policy_min_prob < 0.5:
+    raise ConfigError(
+      f"agent.policy_min_prob={agent.policy_min_prob} must be within (0, 1/2)"
+    )
   if not agent.v_min < agent.initial_value < agent.v_max:
     raise ConfigError(
       f"agent.initial_value={agent.initial_value} must lie between agent.v_min="
       f"{agent.v_min} and agent.v_max={agent.v_max}"
     )
+
+
+def _validate_epsilon(agent: AgentConfig) -> None:
   samples = min(agent.target_samples, agent.policy_samples)
   # The KL of a distribution over S samples from their uniform weights is at most
   # log S: a larger limit never binds, and the temperature would run to zero.

@@ -90,9 +90,9 @@ def test_kl_never_passes_the_logarithm_of_the_samples():
 
 def test_pick_follows_the_weights():
   q, alpha = random_q(5, batch=2)[:6], jnp.array([0.2, 0.7])
-  draw = jax.vmap(lambda key: boltzmann.pick(key, q, alpha))
-  picked = np.asarray(draw(jax.random.split(jax.random.key(0), 40_000)))
   weights = boltzmann.importance_weights(q, alpha)
+  draw = jax.vmap(lambda key: boltzmann.pick(key, weights))
+  picked = np.asarray(draw(jax.random.split(jax.random.key(0), 40_000)))
   for i in range(2):
     shares = np.bincount(picked[:, i], minlength=6) / 40_000
     np.testing.assert_allclose(shares, weights[:, i], atol=0.012)

@@ -84,6 +84,12 @@ def test_every_field_has_a_docstring():
     ("agent.epsilon", math.log(100), ["4.605", "policy_samples"]),
     ("agent.epsilon", float("nan"), ["finite"]),
     ("agent.epsilon", 0.0, ["positive"]),
+    ("agent.temperature", "none", ["state", "shared", "fixed"]),
+    ("agent.regulariser", "b", ["row", "uniform"]),
+    ("agent.policy_evaluation", "mc", ["row", "retrace"]),
+    ("agent.prior_mean", "zero", ["primitives", "learned"]),
+    ("agent.policy_initial_std", 2.0, ["agent.policy_max_std"]),
+    ("agent.policy_min_prob", 0.5, ["(0, 1/2)"]),
     ("agent.gamma", 1.5, ["(0, 1]"]),
     ("agent.v_min", 1.0, ["agent.v_max"]),
     ("agent.hidden", (), ["agent.hidden"]),
@@ -107,7 +113,7 @@ def test_refusals_name_the_setting_and_the_fix(path, value, words):
     validate(
       changed(path, value),
       tasks=["push_plate", "stack_box"],
-      algorithms=["ap_npql", "sac"],
+      algorithms={"ap_npql": True, "sac": False},
     )
   message = str(error.value)
   assert "\n" not in message
@@ -115,8 +121,11 @@ def test_refusals_name_the_setting_and_the_fix(path, value, words):
     assert word in message
 
 
-def test_epsilon_just_below_the_log_of_the_samples_is_accepted():
-  validate(changed("agent.epsilon", math.log(100) - 1e-6))
+@pytest.mark.parametrize(
+  ("epsilon", "weighed"), [(math.log(100) - 1e-6, True), (9.0, False)]
+)
+def test_epsilon_is_bounded_only_where_candidates_are_weighed(epsilon, weighed):
+  validate(changed("agent.epsilon", epsilon), algorithms={"ap_npql": weighed})
 
 
 def test_replay_that_holds_no_transition_is_refused():

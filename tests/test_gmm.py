@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from scipy import integrate, special, stats
 
-from apnpql_jax.dists import gmm
 from apnpql_jax.dists.gmm import GripperGMM
 
 
@@ -52,9 +51,9 @@ def scipy_log_prob(mixture: GripperGMM, actions: np.ndarray) -> np.ndarray:
 
 def test_log_prob_matches_scipy_for_every_batch_element():
   mixture = random_gmm(0, batch=(2, 3))
-  actions = gmm.sample(jax.random.key(1), mixture, 50)
+  actions = mixture.sample(jax.random.key(1), 50)
   assert actions.shape == (50, 2, 3, 7)
-  ours = jax.jit(gmm.log_prob)(mixture, actions)
+  ours = jax.jit(GripperGMM.log_prob)(mixture, actions)
   for i in np.ndindex(2, 3):
     one = jax.tree.map(lambda x, i=i: x[i], mixture)
     expected = scipy_log_prob(one, np.asarray(actions[(slice(None), *i)]))
@@ -83,27 +82,25 @@ def assert_gradient(
 
 def test_log_prob_gradient_matches_finite_differences_of_scipy():
   mixture = random_gmm(3, dim=2)
-  actions = np.asarray(gmm.sample(jax.random.key(0), mixture, 20))
-  grads = jax.grad(lambda m: jnp.sum(gmm.log_prob(m, jnp.asarray(actions))))(mixture)
+  actions = np.asarray(mixture.sample(jax.random.key(0), 20))
+  grads = jax.grad(lambda m: jnp.sum(m.log_prob(jnp.asarray(actions))))(mixture)
   assert_gradient(grads, mixture, lambda m: scipy_log_prob(m, actions).sum())
 
 
 def test_log_prob_matches_distrax_where_the_gripper_is_a_coin():
   mixture = random_gmm(5, batch=(4,)).replace(gripper_logits=jnp.zeros((4, 3)))
-  actions = gmm.sample(jax.random.key(3), mixture, 30)
+  actions = mixture.sample(jax.random.key(3), 30)
   arm = distrax.MixtureSameFamily(
     distrax.Categorical(logits=mixture.logits),
     distrax.MultivariateNormalTri(mixture.mean, mixture.scale_tril),
   )
   expected = arm.log_prob(actions[..., :6]) - np.log(2.0)
-  np.testing.assert_allclose(
-    gmm.log_prob(mixture, actions), expected, rtol=1e-4, atol=1e-4
-  )
+  np.testing.assert_allclose(mixture.log_prob(actions), expected, rtol=1e-4, atol=1e-4)
 
 
 def test_samples_have_the_moments_of_the_mixture():
   mixture = random_gmm(4)
-  actions = np.asarray(gmm.sample(jax.random.key(2), mixture, 200_000))
+  actions = np.asarray(mixture.sample(jax.random.key(2), 200_000))
   weights = special.softmax(np.asarray(mixture.logits))
   means = np.asarray(mixture.mean)
   scale = np.asarray(mixture.scale_tril)
@@ -128,7 +125,7 @@ def test_gripper_belongs_to_the_component_of_the_arm():
     scale_tril=jnp.tile(0.1 * jnp.eye(6), (2, 1, 1)),
     gripper_logits=jnp.array([-2.0, 1.0]),
   )
-  actions = np.asarray(gmm.sample(jax.random.key(0), mixture, 50_000))
+  actions = np.asarray(mixture.sample(jax.random.key(0), 50_000))
   left = actions[:, 0] < 0.0
   assert actions[left, 6].mean() == pytest.approx(special.expit(-2.0), abs=0.01)
   assert actions[~left, 6].mean() == pytest.approx(special.expit(1.0), abs=0.01)
@@ -147,10 +144,10 @@ def integrated_entropy(mixture: GripperGMM) -> float:
 @pytest.mark.parametrize("seed", range(6))
 def test_entropy_bound_lies_below_the_integral_and_above_the_components(seed: int):
   mixture = random_gmm(seed, dim=1, spread=1.5)
-  bound = float(gmm.entropy_bound(mixture))
+  bound = float(mixture.entropy_bound())
   entropy = integrated_entropy(mixture)
   weights = special.softmax(np.asarray(mixture.logits))
-  conditional = float(weights @ np.asarray(gmm.component_entropy(mixture)))
+  conditional = float(weights @ np.asarray(mixture.component_entropy()))
   assert conditional - 1e-5 <= bound <= entropy + 1e-5
   # The gap to the truth is at most what is unknown: which component it was.
   assert entropy - bound < stats.entropy(weights)
@@ -169,16 +166,16 @@ def test_entropy_bound_is_exact_at_the_extremes(case: str):
   else:
     mixture = random_gmm(7, dim=1, num=2)
     mixture = mixture.replace(gripper_logits=jnp.array([-30.0, 30.0]))
-  bound = float(gmm.entropy_bound(mixture))
+  bound = float(mixture.entropy_bound())
   assert bound == pytest.approx(integrated_entropy(mixture), abs=2e-4)
 
 
 def test_entropy_bound_in_six_dimensions_against_monte_carlo():
   mixture = random_gmm(11, spread=0.7)
-  actions = np.asarray(gmm.sample(jax.random.key(5), mixture, 40_000))
+  actions = np.asarray(mixture.sample(jax.random.key(5), 40_000))
   surprise = -scipy_log_prob(mixture, actions)
   error = surprise.std() / np.sqrt(surprise.size)
-  bound = float(gmm.entropy_bound(mixture))
+  bound = float(mixture.entropy_bound())
   assert bound <= surprise.mean() + 4.0 * error
   assert bound >= surprise.mean() - 0.7
 
@@ -209,14 +206,14 @@ def numpy_bound(mixture: GripperGMM) -> float:
 
 def test_entropy_bound_and_its_gradient_match_the_formula_in_double_precision():
   mixture = random_gmm(2, dim=3, spread=0.5)
-  value, grads = jax.value_and_grad(gmm.entropy_bound)(mixture)
+  value, grads = jax.value_and_grad(GripperGMM.entropy_bound)(mixture)
   assert value == pytest.approx(numpy_bound(mixture), abs=1e-4)
   assert_gradient(grads, mixture, numpy_bound)
 
 
 def test_entropy_bound_of_a_batch_is_that_of_its_elements():
   mixture = random_gmm(8, batch=(2, 3))
-  ours = jax.jit(gmm.entropy_bound)(mixture)
+  ours = jax.jit(GripperGMM.entropy_bound)(mixture)
   for i in np.ndindex(2, 3):
     one = jax.tree.map(lambda x, i=i: x[i], mixture)
     assert ours[i] == pytest.approx(numpy_bound(one), abs=1e-3)
@@ -224,10 +221,10 @@ def test_entropy_bound_of_a_batch_is_that_of_its_elements():
 
 def test_entropy_and_density_stay_finite_where_the_gripper_is_certain():
   mixture = random_gmm(1).replace(gripper_logits=jnp.array([-60.0, 60.0, 0.0]))
-  actions = gmm.sample(jax.random.key(0), mixture, 10)
+  actions = mixture.sample(jax.random.key(0), 10)
 
   def total(mixture: GripperGMM) -> jax.Array:
-    return gmm.entropy_bound(mixture) + jnp.mean(gmm.log_prob(mixture, actions))
+    return mixture.entropy_bound() + jnp.mean(mixture.log_prob(actions))
 
   value, grads = jax.value_and_grad(total)(mixture)
   assert np.isfinite(value)

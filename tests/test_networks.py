@@ -10,14 +10,20 @@ import numpy as np
 import pytest
 
 from apnpql_jax.agents import encoder
-from apnpql_jax.agents.networks import GROUPS, make_networks
-from apnpql_jax.agents.prior import one_way_clip, prior_from_outputs
+from apnpql_jax.agents.evaluation import Categorical
+from apnpql_jax.agents.mixture import mixture_from_outputs, one_way_clip
+from apnpql_jax.agents.networks import GROUPS, Heads, Networks, make_networks
 from apnpql_jax.config import AgentConfig
 from apnpql_jax.types import Observation
 
 CONFIG = AgentConfig(
   hidden=(24, 16), feature_dim=20, num_atoms=11, patch_channels=5, conv_channels=6
 )
+
+
+def all_networks(config: AgentConfig = CONFIG) -> Networks:
+  """Networks with every group, and categorical values."""
+  return make_networks(config, GROUPS, Categorical(config))
 
 
 def observation(batch: int, *, pixels: bool, objects: bool = False) -> Observation:
@@ -88,32 +94,33 @@ def test_robot_inputs_hold_the_newest_state_and_the_changes():
   "pixels, objects", [(True, False), (False, True), (True, True)]
 )
 def test_outputs_have_the_declared_shapes(pixels: bool, objects: bool):
-  networks = make_networks(CONFIG)
+  networks = all_networks()
   seen = observation(4, pixels=pixels, objects=objects)
   params = networks.init(jax.random.key(0), seen)
   assert tuple(params) == GROUPS
-  phi = networks.features(params, seen)
-  assert phi.shape == (4, 20)
-  assert networks.primitives(params, phi).shape == (4, 3, 7)
-  assert networks.alpha(params, phi).shape == (4,)
-  assert networks.q_logits(params, phi, jnp.zeros((9, 4, 7))).shape == (9, 4, 11)
-  prior = networks.prior(params, phi)
-  assert prior.mean.shape == (4, 3, 6)
-  assert prior.scale_tril.shape == (4, 3, 6, 6)
-  assert prior.logits.shape == prior.gripper_logits.shape == (4, 3)
+  heads = networks.at(params, seen)
+  assert heads.phi.shape == (4, 20)
+  assert heads.primitives().shape == (4, 3, 7)
+  assert heads.alpha().shape == (4,)
+  assert heads.z(jnp.zeros((9, 4, 7))).shape == (9, 4, 11)
+  assert heads.q(jnp.zeros((9, 4, 7))).shape == (9, 4)
+  for num, mixture in ((3, heads.prior()), (1, heads.policy())):
+    assert mixture.mean.shape == (4, num, 6)
+    assert mixture.scale_tril.shape == (4, num, 6, 6)
+    assert mixture.logits.shape == mixture.gripper_logits.shape == (4, num)
 
 
 @pytest.mark.parametrize("changed", ["robot", "global_image", "wrist_image"])
 def test_features_depend_on_every_modality(changed: str):
-  networks = make_networks(CONFIG)
+  networks = all_networks()
   seen = observation(2, pixels=True)
   params = networks.init(jax.random.key(0), seen)
   other = seen.replace(**{changed: getattr(seen, changed) // 2})
-  assert np.any(networks.features(params, seen) != networks.features(params, other))
+  assert np.any(networks.at(params, seen).phi != networks.at(params, other).phi)
 
 
 def test_value_head_is_a_plain_network_of_features_and_action():
-  networks = make_networks(CONFIG)
+  networks = all_networks()
   params = networks.init(jax.random.key(0), observation(3, pixels=False))
   rng = np.random.default_rng(2)
   phi = jnp.asarray(rng.normal(size=(3, 20)), jnp.float32)
@@ -130,32 +137,71 @@ def test_value_head_is_a_plain_network_of_features_and_action():
   x = np.maximum(both @ kernel + z["phi"]["bias"], 0.0)
   x = np.maximum(x @ z["Dense_0"]["kernel"] + z["Dense_0"]["bias"], 0.0)
   expected = x @ z["out"]["kernel"] + z["out"]["bias"]
-  ours = networks.q_logits(params, phi, actions)
+  ours = Heads(networks, params, phi).z(actions)
   np.testing.assert_allclose(ours, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_fresh_networks_predict_the_configured_start():
   config = dataclasses.replace(CONFIG, initial_alpha=0.3, initial_value=0.2)
-  networks = make_networks(config)
-  seen = observation(8, pixels=False)
-  params = networks.init(jax.random.key(0), seen)
-  phi = networks.features(params, seen)
-  np.testing.assert_allclose(networks.alpha(params, phi), 0.3, atol=0.02)
-  logits = networks.q_logits(params, phi, jnp.zeros((1, 8, 7)))
-  values = jax.nn.softmax(logits) @ networks.atoms
-  np.testing.assert_allclose(values, 0.2, atol=0.02)
-  prior = networks.prior(params, phi)
+  heads = fresh_heads(config)
+  np.testing.assert_allclose(heads.alpha(), 0.3, atol=0.02)
+  np.testing.assert_allclose(heads.q(jnp.zeros((1, 8, 7))), 0.2, atol=0.02)
   expected = np.broadcast_to(config.initial_std * np.eye(6), (8, 3, 6, 6))
-  np.testing.assert_allclose(prior.scale_tril, expected, atol=0.02)
+  np.testing.assert_allclose(heads.prior().scale_tril, expected, atol=0.02)
+  expected = np.broadcast_to(config.policy_initial_std * np.eye(6), (8, 1, 6, 6))
+  np.testing.assert_allclose(heads.policy().scale_tril, expected, atol=0.02)
+  np.testing.assert_allclose(heads.policy().mean, 0.0, atol=0.05)
+
+
+def fresh_heads(config: AgentConfig) -> Heads:
+  """Untrained networks at eight states."""
+  networks, seen = all_networks(config), observation(8, pixels=False)
+  return networks.at(networks.init(jax.random.key(0), seen), seen)
+
+
+@pytest.mark.parametrize(("mode", "values"), [("state", 8), ("shared", 1)])
+def test_one_temperature_is_for_each_state_or_for_all(mode: str, values: int):
+  heads = fresh_heads(dataclasses.replace(CONFIG, temperature=mode))
+  moved = jax.tree.map(lambda x: x + 0.5, heads.params["alpha"])
+  alpha = dataclasses.replace(heads, params={**heads.params, "alpha": moved}).alpha()
+  assert len(np.unique(alpha)) == values
+  assert np.all(alpha > heads.alpha() + 0.01)
+
+
+def test_a_fixed_temperature_reads_no_parameter():
+  config = dataclasses.replace(CONFIG, temperature="fixed", initial_alpha=0.25)
+  heads = dataclasses.replace(fresh_heads(config), params={})
+  np.testing.assert_allclose(heads.alpha(), 0.25 + config.min_alpha, rtol=1e-6)
+
+
+def test_a_learned_mean_is_trained_and_kept_in_the_box():
+  heads = fresh_heads(dataclasses.replace(CONFIG, prior_mean="learned"))
+
+  def mean(bias: jax.Array) -> jax.Array:
+    head = heads.params["bp"]
+    head = {**head, "out": {**head["out"], "bias": bias}}
+    return dataclasses.replace(heads, params={**heads.params, "bp": head}).prior().mean
+
+  bias = jnp.zeros(3 * 29)
+  assert np.count_nonzero(jax.grad(lambda b: jnp.sum(mean(b)))(bias)) == 18
+  assert np.all(mean(bias - 9.0) == -1.0)
+
+
+def test_diagonal_covariances_have_nothing_beside_the_diagonal():
+  heads = fresh_heads(dataclasses.replace(CONFIG, diagonal_covariance=True))
+  for mixture in (heads.prior(), heads.policy()):
+    scale = np.asarray(mixture.scale_tril)
+    assert np.all(scale == scale * np.eye(6))
+    assert np.all(np.diagonal(scale, axis1=-2, axis2=-1) > 0.0)
 
 
 def test_prior_keeps_its_floors_and_limits():
   rng = np.random.default_rng(3)
   outputs = jnp.asarray(20.0 * rng.normal(size=(200, 3 * 23)), jnp.float32)
-  prior = prior_from_outputs(
+  prior = mixture_from_outputs(
     outputs,
-    jnp.zeros((200, 3, 6)),
-    jnp.zeros((200, 3)),
+    jnp.zeros((200, 3, 7)),
+    num=3,
     min_std=0.05,
     initial_std=0.2,
     max_std=0.5,
@@ -196,14 +242,13 @@ def test_a_limit_lets_the_gradient_back_in():
 
 
 def test_prior_is_centred_on_the_primitives_within_the_action_box():
-  networks = make_networks(CONFIG)
+  networks = all_networks()
   seen = observation(4, pixels=False)
   params = networks.init(jax.random.key(0), seen)
   params["ap"]["out"]["bias"] = jnp.linspace(-4.0, 4.0, 21)
-  phi = networks.features(params, seen)
-  primitives = np.asarray(networks.primitives(params, phi))
+  heads = networks.at(params, seen)
+  primitives, prior = np.asarray(heads.primitives()), heads.prior()
   expected = np.clip(primitives[..., :6], -1.0, 1.0)
-  prior = networks.prior(params, phi)
   np.testing.assert_array_equal(prior.mean, expected)
   assert np.abs(expected).max() == 1.0
   surest = np.log((1 - CONFIG.min_prob) / CONFIG.min_prob)

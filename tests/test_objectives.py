@@ -10,7 +10,7 @@ import rlax
 from scipy import special
 
 from apnpql_jax.agents import objectives
-from apnpql_jax.dists import boltzmann, categorical, gmm
+from apnpql_jax.dists import boltzmann, categorical
 from apnpql_jax.dists.gmm import GripperGMM
 
 ATOMS = categorical.support(v_min=0.0, v_max=1.0, num_atoms=51)
@@ -119,13 +119,13 @@ def test_alpha_loss_does_not_train_the_values():
 
 def test_m_step_without_entropy_is_the_policy_loss_of_mpo():
   prior = random_prior(0, batch=4)
-  samples = gmm.sample(jax.random.key(0), prior, 64)
+  samples = prior.sample(jax.random.key(0), 64)
   q, alpha = random_array(10, 64, 4), jnp.full((4,), 0.7)
   weights = boltzmann.importance_weights(q, alpha)
   ours = objectives.m_step_loss(prior, samples, weights, jnp.zeros(()))
   zero = rlax.LagrangePenalty(jnp.float32(0.0), jnp.float32(0.0))
   _, outputs = rlax.mpo_loss(
-    sample_log_probs=gmm.log_prob(prior, samples),
+    sample_log_probs=prior.log_prob(samples),
     sample_q_values=q,
     temperature_constraint=rlax.LagrangePenalty(alpha, jnp.float32(1.0)),
     kl_constraints=[(jnp.zeros((4,)), zero)],
@@ -137,14 +137,14 @@ def test_m_step_without_entropy_is_the_policy_loss_of_mpo():
 
 def test_m_step_rewards_entropy():
   prior = random_prior(1, batch=2)
-  samples = gmm.sample(jax.random.key(0), prior, 8)
+  samples = prior.sample(jax.random.key(0), 8)
   weights = jnp.full((8, 2), 1.0 / 8.0)
   without, with_nu = (
     objectives.m_step_loss(prior, samples, weights, jnp.float32(nu))
     for nu in (0.0, 2.0)
   )
   np.testing.assert_allclose(
-    without - with_nu, 2.0 * gmm.entropy_bound(prior), rtol=1e-4, atol=1e-4
+    without - with_nu, 2.0 * prior.entropy_bound(), rtol=1e-4, atol=1e-4
   )
 
 
@@ -154,7 +154,7 @@ def test_m_step_trains_neither_samples_nor_weights_nor_nu():
   def total(inputs) -> jax.Array:
     return jnp.sum(objectives.m_step_loss(prior, *inputs))
 
-  samples = gmm.sample(jax.random.key(0), prior, 8)
+  samples = prior.sample(jax.random.key(0), 8)
   inputs = (samples, jnp.full((8, 2), 1.0 / 8.0), jnp.float32(0.5))
   assert all(not np.any(g) for g in jax.tree.leaves(jax.grad(total)(inputs)))
 
@@ -162,7 +162,7 @@ def test_m_step_trains_neither_samples_nor_weights_nor_nu():
 def test_m_step_moves_the_prior_towards_the_policy():
   """Descent lowers KL(q || b), here by weighing the right component (Eq. 3)."""
   prior = random_prior(3, batch=1).replace(logits=jnp.zeros((1, 3)))
-  samples = gmm.sample(jax.random.key(1), prior, 2000)
+  samples = prior.sample(jax.random.key(1), 2000)
   distance = jnp.linalg.norm(samples[..., :6] - prior.mean[None, :, 1], axis=-1)
   weights = boltzmann.importance_weights(-distance, jnp.full((1,), 0.1))
 

@@ -15,13 +15,13 @@ from scipy import stats
 
 from apnpql_jax import memory, replay as rb
 from apnpql_jax.config import ConfigError
-from apnpql_jax.types import Observation, TimeStep, Transition
+from apnpql_jax.types import Observation, Slot, TimeStep, Transition
 
 GAMMA = 0.9
 WORLDS = 2
 
 
-def _example(pixels: int = 2) -> rb.Slot:
+def _example(pixels: int = 2) -> Slot:
   spec: Any = jax.ShapeDtypeStruct
   observation = Observation(
     robot=spec((2,), jnp.float32), global_image=spec((pixels, 3, 3), jnp.uint8)
@@ -33,10 +33,12 @@ def _example(pixels: int = 2) -> rb.Slot:
     truncated=spec((), jnp.bool_),
     primitives=spec((3, 7), jnp.float32),
   )
-  return rb.Slot(timestep=timestep, action=spec((7,), jnp.float32))
+  return Slot(
+    timestep=timestep, action=spec((7,), jnp.float32), log_prob=spec((), jnp.float32)
+  )
 
 
-def _stream(steps: int, worlds: int, end_rate: float, seed: int) -> rb.Slot:
+def _stream(steps: int, worlds: int, end_rate: float, seed: int) -> Slot:
   """Random slots [steps, worlds]; the robot state is the slot's (time, world)."""
   rng: Any = np.random.default_rng(seed)
   end: Any = rng.random((steps, worlds)) < end_rate
@@ -54,14 +56,15 @@ def _stream(steps: int, worlds: int, end_rate: float, seed: int) -> rb.Slot:
     primitives=rng.normal(size=(steps, worlds, 3, 7)).astype(np.float32),
   )
   action = rng.normal(size=(steps, worlds, 7)).astype(np.float32)
-  return rb.Slot(timestep=timestep, action=action)
+  log_prob = rng.normal(size=(steps, worlds)).astype(np.float32)
+  return Slot(timestep=timestep, action=action, log_prob=log_prob)
 
 
 def _image(observation: Observation) -> Any:
   return observation.global_image
 
 
-def _fill(stream: rb.Slot, length: int, chunk: int) -> rb.Replay:
+def _fill(stream: Slot, length: int, chunk: int) -> rb.Replay:
   steps, worlds = stream.action.shape[:2]
   add = jax.jit(rb.add, donate_argnums=0)
   replay = rb.create(_example(), length, worlds)
@@ -148,6 +151,22 @@ def test_no_transition_leaves_its_episode(n_step: int):
   # The early stop is exercised, and nothing older than the ring is seen.
   assert (t_next - t).min() >= 1 and (t_next - t).max() == n_step
   assert t.min() >= 16 and t_next.max() <= 47
+
+
+def test_windows_are_the_slots_after_the_start_across_the_seam():
+  stream = _stream(48, WORLDS, 0.2, seed=4)
+  replay = _fill(stream, length=32, chunk=16)  # Newest and oldest slot are neighbours.
+  draw = functools.partial(rb.sample, replay, jax.random.key(0))
+  draw = functools.partial(draw, batch_size=64, n_step=4, gamma=GAMMA)
+  batch = jax.device_get(draw(windows=True))
+  t, w = batch.observation_tm1.robot.astype(int).T
+  after = t[:, None] + np.arange(1, 5)
+  expected = jax.tree.map(lambda x: x[after, w[:, None]], stream)
+  jax.tree.map(np.testing.assert_array_equal, batch.window, expected)
+  # Nothing else is drawn otherwise.
+  without = jax.device_get(draw())
+  assert without.window is None
+  jax.tree.map(np.testing.assert_array_equal, without, batch.replace(window=None))
 
 
 def test_rewards_worked_by_hand():

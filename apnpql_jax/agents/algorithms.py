@@ -9,45 +9,118 @@ from __future__ import annotations
 from collections.abc import Callable
 import dataclasses
 
-from apnpql_jax.agents import objectives, policies
-from apnpql_jax.config import check_name
+from apnpql_jax.agents.evaluation import (
+  TD0,
+  Categorical,
+  ClippedDoubleQ,
+  Evaluation,
+  Retrace,
+)
+from apnpql_jax.agents.networks import GROUPS
+from apnpql_jax.agents.policies import (
+  Candidates,
+  cross_entropy,
+  non_parametric,
+  parametric,
+)
+from apnpql_jax.agents.projections import Improvement, forward_kl, none, reverse_kl
+from apnpql_jax.agents.regularisers import (
+  Losses,
+  behaviour_prior,
+  fit_advantageous,
+  fit_candidates,
+  no_update,
+  previous_policy,
+  uniform,
+)
+from apnpql_jax.config import AgentConfig, check_name
+from apnpql_jax.dists.action import ActionDistribution
 
 
 @dataclasses.dataclass(frozen=True)
 class Algorithm:
   """One row of Table I; the columns are functions."""
 
-  regulariser: Callable
-  """b: (networks, params, phi) -> distribution the policy is kept close to."""
+  regulariser: Callable[..., ActionDistribution]
+  """b: (heads, target network's heads) -> distribution the policy is kept close to."""
 
-  policy: Callable
-  """(networks, params, phi, b, key, num_samples) -> weighted Candidates."""
+  policy: Callable[..., Candidates]
+  """What acts and is evaluated: (heads, b, key, num_samples) -> weighted candidates."""
 
-  regulariser_update: Callable
-  """(b, samples, weights, nu) -> loss f32[*b] that trains b."""
+  regulariser_update: Callable[..., Losses]
+  """(heads, b, candidates, batch, key, nu) -> losses of b and nu; the candidates are
+  those of the improved policy."""
 
-  policy_update: None
-  """Projection of q onto a parametric policy; None where q itself acts."""
+  policy_update: Callable[..., Improvement]
+  """(heads, b, key) -> the improved policy, and the losses of psi and alpha."""
 
-  policy_evaluation: Callable
-  """(logits_t, weights_t, reward_t, discount_t, atoms) -> target probabilities."""
+  policy_evaluation: Callable[[AgentConfig], Evaluation]
+  """Value head, target and loss."""
+
+  def groups(self, config: AgentConfig) -> tuple[str, ...]:
+    """Parameter groups that the columns read, in the order of ``GROUPS``."""
+    absent = {
+      "bp": self.regulariser is not behaviour_prior,
+      "policy": self.policy is not parametric,
+      "alpha": config.temperature == "fixed",
+    }
+    return tuple(group for group in GROUPS if not absent.get(group))
 
 
 ALGORITHMS = {
-  #           regulariser               policy                   regulariser update
-  #           policy update             policy evaluation
+  # regulariser,   policy,        regulariser update, policy update, policy evaluation
   "ap_npql": Algorithm(
-    policies.behaviour_prior, policies.non_parametric, objectives.m_step_loss,
-    None,                     objectives.value_target,
+    behaviour_prior, non_parametric, fit_candidates,   none,       Categorical,
+  ),
+  "ap_mpo": Algorithm(
+    behaviour_prior, parametric,     fit_candidates,   forward_kl, Categorical,
+  ),
+  "ap_sac": Algorithm(
+    behaviour_prior, parametric,     fit_candidates,   reverse_kl, Categorical,
+  ),
+  "abm_mpo": Algorithm(
+    behaviour_prior, parametric,     fit_advantageous, forward_kl, TD0,
+  ),
+  "svg_prior": Algorithm(
+    behaviour_prior, parametric,     fit_candidates,   reverse_kl, Retrace,
+  ),
+  "mpo": Algorithm(
+    previous_policy, parametric,     no_update,        forward_kl, Retrace,
+  ),
+  "sac": Algorithm(
+    uniform,         parametric,     no_update,        reverse_kl, ClippedDoubleQ,
+  ),
+  "ap_cem": Algorithm(
+    behaviour_prior, cross_entropy,  fit_candidates,   none,       ClippedDoubleQ,
   ),
 }  # fmt: skip
+"""The last row is not in the table: QT-Opt's policy, for b with action primitives."""
+
+EVALUATIONS = {
+  "categorical": Categorical,
+  "td0": TD0,
+  "retrace": Retrace,
+  "clipped_double_q": ClippedDoubleQ,
+}
+"""Values of ``agent.policy_evaluation`` beside "row"."""
 
 
-def get_algorithm(name: str) -> Algorithm:
-  """The row called ``name``.
+def algorithm_of(config: AgentConfig) -> Algorithm:
+  """The row that ``config`` names, with the columns that it replaces.
 
   Raises:
     ConfigError: no such row; the message lists the valid names.
   """
-  check_name("agent.algorithm", name, tuple(ALGORITHMS))
-  return ALGORITHMS[name]
+  check_name("agent.algorithm", config.algorithm, tuple(ALGORITHMS))
+  row = ALGORITHMS[config.algorithm]
+  if config.regulariser == "uniform":
+    row = dataclasses.replace(row, regulariser=uniform, regulariser_update=no_update)
+  if config.policy_evaluation != "row":
+    evaluation = EVALUATIONS[config.policy_evaluation]
+    row = dataclasses.replace(row, policy_evaluation=evaluation)
+  return row
+
+
+def epsilon_is_bounded() -> dict[str, bool]:
+  """Name of each row -> whether epsilon must lie below log of the candidates."""
+  return {name: row.policy_update is not reverse_kl for name, row in ALGORITHMS.items()}

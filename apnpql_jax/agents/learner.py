@@ -1,4 +1,4 @@
-"""The AP-NPQL agent: pure functions to act and to learn (paper Algorithm 1)."""
+"""The agent: pure functions to act and to learn (paper Algorithm 1)."""
 
 from __future__ import annotations
 
@@ -12,17 +12,22 @@ import jax.numpy as jnp
 import optax
 
 from apnpql_jax.agents import objectives
-from apnpql_jax.agents.algorithms import ALGORITHMS, Algorithm, get_algorithm
-from apnpql_jax.agents.networks import GROUPS, Networks, Params, make_networks
+from apnpql_jax.agents.algorithms import (
+  Algorithm,
+  algorithm_of,
+  epsilon_is_bounded,
+)
+from apnpql_jax.agents.networks import Heads, Networks, Params, make_networks
+from apnpql_jax.agents.policies import Candidates
 from apnpql_jax.config import AgentConfig, TrainConfig, validate
-from apnpql_jax.dists import boltzmann, categorical, gmm
+from apnpql_jax.dists import boltzmann
 from apnpql_jax.types import Array, Metrics, Observation, Transition
 
 
 class LearnerState(struct.PyTreeNode):
   """All that the learner needs to go on."""
 
-  params: Params  # one entry per name in GROUPS
+  params: Params  # one entry per group that the algorithm has
   target_params: Params  # slow average of params
   nu: Array  # f32[] >= 0: multiplier of the entropy floor
   opt_state: Any  # of one Adam per learning rate
@@ -41,8 +46,8 @@ class Agent:
   act: Callable[[Params, Observation, Array, bool], tuple[Array, Metrics]]
   """(params, observation [B], key, greedy) -> actions f32[B, 7], info f32[B] each.
 
-  Candidates come from the prior; one is drawn in proportion to exp(Q / alpha), or,
-  if greedy (a Python bool), the best is taken."""
+  The policy's candidates are drawn, and one is picked by its weights, or, if greedy
+  (a Python bool), the one of highest value."""
 
   update: Callable[[LearnerState, Transition, Array], tuple[LearnerState, Metrics]]
   """(state, transitions [B], key) -> state after one update, metrics f32[]."""
@@ -55,10 +60,11 @@ def make_agent(config: AgentConfig) -> Agent:
     ConfigError: unknown algorithm, or settings that cannot work, such as a KL limit
       that the samples can never reach.
   """
-  validate(TrainConfig(agent=config), algorithms=tuple(ALGORITHMS))
-  networks = make_networks(config)
-  algorithm = get_algorithm(config.algorithm)
-  optimiser = make_optimiser(config)
+  validate(TrainConfig(agent=config), algorithms=epsilon_is_bounded())
+  algorithm = algorithm_of(config)
+  groups = algorithm.groups(config)
+  networks = make_networks(config, groups, algorithm.policy_evaluation(config))
+  optimiser = make_optimiser(config, groups)
 
   def init(key: Array, observation: Observation) -> LearnerState:
     params = networks.init(key, observation)
@@ -83,12 +89,12 @@ def make_agent(config: AgentConfig) -> Agent:
     target = bellman_target(networks, algorithm, state.target_params, batch, key_t)
     trained = {**state.params, "nu": state.nu}
     grads, metrics = jax.grad(total_loss, argnums=2, has_aux=True)(
-      networks, algorithm, trained, batch, target, key_tm1
+      networks, algorithm, trained, state.target_params, batch, target, key_tm1
     )
     steps, opt_state = optimiser.update(grads, state.opt_state, trained)
     params = jax.tree.map(jnp.add, trained, steps)
     nu = jnp.maximum(params.pop("nu"), 0.0)
-    metrics |= {f"grad_norm/{k}": optax.tree.norm(grads[k]) for k in GROUPS}
+    metrics |= {f"grad_norm/{k}": optax.tree.norm(grads[k]) for k in groups}
     metrics["prior/nu"] = nu
     target_params = jax.tree.map(
       lambda new, old: old + config.target_rate * (new - old),
@@ -100,8 +106,13 @@ def make_agent(config: AgentConfig) -> Agent:
   return Agent(networks, init, act, update)
 
 
-def make_optimiser(config: AgentConfig) -> optax.GradientTransformation:
-  """Adam with a clipped global norm for each step of Algorithm 1, by group."""
+def make_optimiser(
+  config: AgentConfig, groups: tuple[str, ...]
+) -> optax.GradientTransformation:
+  """Adam with a clipped global norm for each step of Algorithm 1, by group.
+
+  A parametric policy has one of its own, at the rate of the E-step that it belongs to.
+  """
 
   def adam(learning_rate: optax.ScalarOrSchedule) -> optax.GradientTransformation:
     return optax.chain(
@@ -111,22 +122,16 @@ def make_optimiser(config: AgentConfig) -> optax.GradientTransformation:
   def m_rate(count: Any) -> Any:
     return jnp.where(count < config.m_step_delay, 0.0, config.learning_rate_m)
 
-  return optax.partition(
-    {
-      "e_step": adam(config.learning_rate_e),
-      "m_step": adam(m_rate),
-      "alpha": adam(config.learning_rate_alpha),
-      "nu": adam(config.learning_rate_nu),
-    },
-    {
-      "encoder": "e_step",
-      "ap": "e_step",
-      "z": "e_step",
-      "bp": "m_step",
-      "alpha": "alpha",
-      "nu": "nu",
-    },
-  )
+  rates = {
+    "e_step": config.learning_rate_e,
+    "m_step": m_rate,
+    "policy": config.learning_rate_e,
+    "alpha": config.learning_rate_alpha,
+    "nu": config.learning_rate_nu,
+  }
+  step = {"encoder": "e_step", "ap": "e_step", "z": "e_step", "bp": "m_step"}
+  labels = {group: step.get(group, group) for group in (*groups, "nu")}
+  return optax.partition({k: adam(rates[k]) for k in labels.values()}, labels)
 
 
 def _act(
@@ -140,28 +145,25 @@ def _act(
 ) -> tuple[Array, Metrics]:
   """Samples candidates and picks one (paper Sec. III-B)."""
   key_candidates, key_pick = jax.random.split(key)
-  phi = networks.features(params, observation)
-  candidates = algorithm.policy(
-    networks,
-    params,
-    phi,
-    algorithm.regulariser(networks, params, phi),
-    key_candidates,
-    num_samples=networks.config.policy_samples,
+  heads = networks.at(params, observation)
+  candidates = _candidates(
+    algorithm, heads, key_candidates, heads.config.policy_samples
   )
-  q_values, alpha = candidates.q_values, candidates.alpha
+  q_values, weights = candidates.q_values, candidates.weights
   if greedy:
     chosen = jnp.argmax(q_values, axis=0)
   else:
-    chosen = boltzmann.pick(key_pick, q_values, alpha)
-  actions = jnp.take_along_axis(candidates.actions, chosen[None, :, None], axis=0)[0]
+    chosen = boltzmann.pick(key_pick, weights)
+  actions = jnp.take_along_axis(candidates.actions, chosen[None, :, None], axis=0)
+  q = jnp.take_along_axis(q_values, chosen[None], axis=0)
   info = {
-    "q": jnp.take_along_axis(q_values, chosen[None], axis=0)[0],
+    "q": q[0],
     "q_max": jnp.max(q_values, axis=0),
-    "alpha": alpha,
-    "ess": boltzmann.effective_sample_size(candidates.weights),
+    "alpha": heads.alpha(),
+    "ess": boltzmann.effective_sample_size(weights),
+    "log_prob": candidates.log_prob(actions, q)[0],
   }
-  return actions, info
+  return actions[0], info
 
 
 def bellman_target(
@@ -171,23 +173,21 @@ def bellman_target(
   batch: Transition,
   key: Array,
 ) -> Array:
-  """Target distribution f32[B, n] from the target network at s_t (paper Eq. 8)."""
-  phi_t = networks.features(target_params, batch.observation_t)
-  candidates_t = algorithm.policy(
-    networks,
-    target_params,
-    phi_t,
-    algorithm.regulariser(networks, target_params, phi_t),
-    key,
-    num_samples=networks.config.target_samples,
-  )
-  return algorithm.policy_evaluation(
-    candidates_t.logits,
-    candidates_t.weights,
-    batch.reward_t,
-    batch.discount_t,
-    networks.atoms,
-  )
+  """Target of the values, by the target network (paper Eq. 8, Sec. V-B)."""
+
+  def look(observation: Observation) -> tuple[Heads, Candidates]:
+    heads = networks.at(target_params, observation)
+    return heads, _candidates(algorithm, heads, key, heads.config.target_samples)
+
+  return networks.evaluation.target(look, batch)
+
+
+def _candidates(
+  algorithm: Algorithm, heads: Heads, key: Array, num_samples: int
+) -> Candidates:
+  """The policy of these heads, which are their own past if the regulariser asks."""
+  prior = algorithm.regulariser(heads, heads)
+  return algorithm.policy(heads, prior, key, num_samples=num_samples)
 
 
 def _ap_errors(predicted: Array, label: Array) -> Metrics:
@@ -205,46 +205,42 @@ def total_loss(
   networks: Networks,
   algorithm: Algorithm,
   trained: Params,
+  target_params: Params,
   batch: Transition,
   target: Array,
   key: Array,
 ) -> tuple[Array, Metrics]:
   """Sum of the losses of Algorithm 1; each reaches only its own parameters."""
-  config = networks.config
-  phi = networks.features(trained, batch.observation_tm1)
-  predicted = networks.primitives(trained, phi)
-  logits = networks.q_logits(trained, phi, batch.action_tm1[None])[0]
-  prior = algorithm.regulariser(networks, trained, phi)
-  candidates = algorithm.policy(
-    networks, trained, phi, prior, key, num_samples=config.policy_samples
-  )
+  config, evaluation = networks.config, networks.evaluation
+  heads = networks.at(trained, batch.observation_tm1)
+  slow = networks.at(target_params, batch.observation_tm1)
+  predicted = heads.primitives()
+  outputs = heads.z(batch.action_tm1[None])[0]
+  prior = algorithm.regulariser(heads, slow)
+  improved = algorithm.policy_update(heads, prior, key)
+  candidates = improved.candidates
   q_values, weights = candidates.q_values, candidates.weights
-  entropy = gmm.entropy_bound(prior)
-  per_state = {
+  losses = {
     "loss/ap": objectives.ap_loss(
       predicted, batch.primitives_tm1, delta=config.ap_delta
     ),
-    "loss/q": objectives.q_loss(logits, target),
-    "loss/alpha": objectives.alpha_loss(
-      q_values, networks.alpha(trained, phi), epsilon=config.epsilon
-    ),
-    "loss/m": algorithm.regulariser_update(
-      prior, candidates.samples, weights, trained["nu"]
-    ),
-    "loss/nu": objectives.nu_loss(trained["nu"], entropy, epsilon_nu=config.epsilon_nu),
+    "loss/q": evaluation.loss(outputs, target),
+    **improved.losses,
+    **algorithm.regulariser_update(heads, prior, candidates, batch, key, trained["nu"]),
+  }
+  per_state = losses | {
     **_ap_errors(predicted, batch.primitives_tm1),
-    "npql/kl_over_eps": boltzmann.kl_to_prior(weights) / config.epsilon,
+    "npql/kl_over_eps": improved.kl / config.epsilon,
     "npql/ess": boltzmann.effective_sample_size(weights),
-    "npql/alpha_mean": candidates.alpha,
+    "npql/alpha_mean": heads.alpha(),
     "npql/max_weight": jnp.max(weights, axis=0),
-    "prior/entropy": entropy,
+    "prior/entropy": prior.entropy_bound(),
     "q/mean": jnp.mean(q_values, axis=0),
-    "q/data": categorical.mean(jax.nn.softmax(logits), networks.atoms),
-    "q/target": categorical.mean(target, networks.atoms),
+    "q/data": evaluation.value(outputs),
+    "q/target": evaluation.expected(target),
   }
   metrics = {k: objectives.weighted_mean(v, batch.weight) for k, v in per_state.items()}
-  total = config.lambda_ap * metrics["loss/ap"] + sum(
-    metrics[k] for k in ("loss/q", "loss/alpha", "loss/m", "loss/nu")
-  )
+  scale = {"loss/ap": config.lambda_ap}
+  total = jnp.sum(jnp.stack([scale.get(k, 1.0) * metrics[k] for k in losses]))
   metrics["q/min"], metrics["q/max"] = jnp.min(q_values), jnp.max(q_values)
   return total, metrics

@@ -1,7 +1,7 @@
-"""The losses of AP-NPQL, one number per state, without networks or parameters.
+"""The losses, one number per state, without networks or parameters.
 
 ``*b`` are any batch axes, S candidate actions come first. What a loss must not
-train is stopped here or in ``Networks``, so that the gradients of a sum of all
+train is stopped here or in ``Heads``, so that the gradients of a sum of all
 losses fall apart into the groups that the paper's Algorithm 1 names.
 """
 
@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from apnpql_jax.dists import boltzmann, categorical, gmm
+from apnpql_jax.dists import boltzmann, categorical
+from apnpql_jax.dists.action import ActionDistribution
 from apnpql_jax.types import Array
 
 
@@ -77,6 +78,31 @@ def q_loss(logits_tm1: Array, target: Array) -> Array:
   return categorical.cross_entropy(target, logits_tm1)
 
 
+def retrace_target(
+  reward_t: Array, discount_t: Array, value_t: Array, q_t: Array, trace_t: Array
+) -> Array:
+  """Retrace return of (s_0, a_0) over a window of N instants (Munos 2016, Eq. 4).
+
+  Instants t = 1..N stand on the last axis. G_{t-1} = r_t + gamma_t (V(s_t) +
+  c_t (G_t - Q(s_t, a_t))), where G_N = Q(s_N, a_N); Q(s_0, a_0) cancels.
+
+  Args:
+    reward_t: f32[*b, N] received on arriving at t.
+    discount_t: f32[*b, N] gamma, zero where the episode terminated on arriving at t.
+    value_t: f32[*b, N] E_pi[Q(s_t, .)].
+    q_t: f32[*b, N] Q(s_t, a_t).
+    trace_t: f32[*b, N] c_t = min(1, pi / mu), zero where the episode ended at t.
+
+  Returns:
+    f32[*b], without gradient.
+  """
+  target = q_t[..., -1]  # Nothing is known beyond the window: no correction there.
+  for t in reversed(range(reward_t.shape[-1])):
+    beyond = trace_t[..., t] * (target - q_t[..., t])
+    target = reward_t[..., t] + discount_t[..., t] * (value_t[..., t] + beyond)
+  return jax.lax.stop_gradient(target)
+
+
 def alpha_loss(q_tm1: Array, alpha_tm1: Array, *, epsilon: float) -> Array:
   """Dual of the KL limit, to be minimised over alpha(s) (paper Eq. 7).
 
@@ -92,8 +118,41 @@ def alpha_loss(q_tm1: Array, alpha_tm1: Array, *, epsilon: float) -> Array:
   return boltzmann.dual(q_tm1, alpha_tm1, epsilon=epsilon)
 
 
+def kl_dual(kl: Array, alpha_tm1: Array, *, epsilon: float) -> Array:
+  """Dual of KL(pi || b) <= epsilon for a parametric policy, over alpha(s).
+
+  Its slope in alpha is that of Eq. 7, epsilon - KL, with the KL of pi for that of q.
+
+  Args:
+    kl: f32[*b] nats; not trained.
+    alpha_tm1: f32[*b].
+    epsilon: limit in nats.
+
+  Returns:
+    f32[*b].
+  """
+  return alpha_tm1 * (epsilon - jax.lax.stop_gradient(kl))
+
+
+def weighted_nll(
+  distribution: ActionDistribution, samples: Array, weights: Array
+) -> Array:
+  """-sum_i w_i log p(a_i): KL from the weighted samples to p, up to a constant.
+
+  Args:
+    distribution: p, what is trained.
+    samples: f32[S, *b, 7] unclipped; not trained.
+    weights: f32[S, *b]; not trained.
+
+  Returns:
+    f32[*b].
+  """
+  samples, weights = jax.lax.stop_gradient((samples, weights))
+  return -jnp.sum(weights * distribution.log_prob(samples), axis=0)
+
+
 def m_step_loss(
-  prior: gmm.GripperGMM, samples: Array, weights: Array, nu: Array
+  prior: ActionDistribution, samples: Array, weights: Array, nu: Array
 ) -> Array:
   """Fits the prior to q and keeps it broad, L^M (paper Eq. 9).
 
@@ -103,16 +162,15 @@ def m_step_loss(
 
   Args:
     prior: b_theta(. | s_tm1) with gradients to theta^bp.
-    samples: f32[S, *b, 7] unclipped draws of the prior.
-    weights: f32[S, *b] their importance weights under q.
+    samples: f32[S, *b, 7] unclipped actions.
+    weights: f32[S, *b] of q, or of another policy, on them.
     nu: f32[] multiplier >= 0.
 
   Returns:
     f32[*b].
   """
-  samples, weights, nu = jax.lax.stop_gradient((samples, weights, nu))
-  nll = -jnp.sum(weights * gmm.log_prob(prior, samples), axis=0)
-  return nll - nu * gmm.entropy_bound(prior)
+  nll = weighted_nll(prior, samples, weights)
+  return nll - jax.lax.stop_gradient(nu) * prior.entropy_bound()
 
 
 def nu_loss(nu: Array, entropy: Array, *, epsilon_nu: float) -> Array:

@@ -1,25 +1,53 @@
-"""Where candidate actions come from and how they are weighed (Table I, column 2)."""
+"""Where actions come from and how they are weighed (Table I, column "policy")."""
 
 from __future__ import annotations
+
+import math
 
 from flax import struct
 import jax
 import jax.numpy as jnp
 
-from apnpql_jax.agents.networks import Networks, Params
-from apnpql_jax.dists import boltzmann, categorical, gmm
-from apnpql_jax.types import Array
+from apnpql_jax.agents.networks import Heads
+from apnpql_jax.dists import boltzmann
+from apnpql_jax.dists.action import ActionDistribution
+from apnpql_jax.dists.gmm import GripperGMM
+from apnpql_jax.types import ARM_DOF, Array
+
+CEM_ITERATIONS = 2
+CEM_SAMPLES = 64
+CEM_ELITES = 6
+"""Of the cross-entropy method, as in QT-Opt (Kalashnikov 2018)."""
+
+CEM_MIN_STD = 0.01
+"""Floor of the deviation of the elites, rad/s, so that the next draw still differs."""
 
 
 class Candidates(struct.PyTreeNode):
-  """S candidate actions per state and the policy's weights on them. No gradients."""
+  """S candidate actions per state and the policy's weights on them."""
 
-  samples: Array  # f32[S, *b, 7]: as drawn, where log b is evaluated
+  samples: Array  # f32[S, *b, 7]: as drawn, where densities are evaluated
   actions: Array  # f32[S, *b, 7]: clipped to the action box, where Q is evaluated
-  logits: Array  # f32[S, *b, n]: Z(s, a_i)
+  outputs: Array  # f32[S, *b, n]: of the value head
   q_values: Array  # f32[S, *b]
-  alpha: Array  # f32[*b]
   weights: Array  # f32[S, *b]: sum to one over S
+  base: ActionDistribution  # [*b]: the policy is base exp(tilt Q), normalised
+  tilt: Array  # f32[*b]: 1 / alpha, or zero where the policy is ``base`` itself
+
+  @property
+  def value(self) -> Array:
+    """E[Q] under the policy, f32[*b]."""
+    return jnp.sum(self.weights * self.q_values, axis=0)
+
+  def log_prob(self, actions: Array, q_values: Array) -> Array:
+    """Log density of actions f32[T, *b, 7] with values f32[T, *b]: f32[T, *b].
+
+    Of q it is an estimate: log b + Q / alpha - log mean_i exp(Q_i / alpha).
+    """
+    tilt = self.tilt[None]
+    log_sum = jax.nn.logsumexp(tilt * self.q_values, axis=0, keepdims=True)
+    log_mean = log_sum - math.log(self.q_values.shape[0])
+    return self.base.log_prob(actions) + tilt * q_values - log_mean
 
 
 def clip_action(actions: Array) -> Array:
@@ -27,38 +55,104 @@ def clip_action(actions: Array) -> Array:
   return jnp.clip(actions, -1.0, 1.0)
 
 
-def behaviour_prior(networks: Networks, params: Params, phi: Array) -> gmm.GripperGMM:
-  """b_theta: mixture around the predicted action primitives (paper Sec. IV-A)."""
-  return networks.prior(params, phi)
-
-
 def non_parametric(
-  networks: Networks,
-  params: Params,
-  phi: Array,
-  prior: gmm.GripperGMM,
-  key: Array,
-  *,
-  num_samples: int,
+  heads: Heads, prior: ActionDistribution, key: Array, *, num_samples: int
 ) -> Candidates:
   """q = b exp(Q / alpha) / Z by self-normalised importance sampling (paper Eq. 6).
 
   Args:
-    networks: what predicts.
-    params: of the networks.
-    phi: f32[*b, n] features.
+    heads: the networks at the states.
     prior: the regulariser b at the same states.
     key: random key.
     num_samples: candidates S per state.
 
   Returns:
-    Candidates drawn from ``prior`` with weights softmax(Q / alpha).
+    Candidates drawn from ``prior`` with weights softmax(Q / alpha); no gradients.
   """
-  params, phi, prior = jax.lax.stop_gradient((params, phi, prior))
-  samples = gmm.sample(key, prior, num_samples)
-  actions = clip_action(samples)
-  logits = networks.q_logits(params, phi, actions)
-  q_values = categorical.mean(jax.nn.softmax(logits), networks.atoms)
-  alpha = networks.alpha(params, phi)
+  heads, prior = heads.frozen(), jax.lax.stop_gradient(prior)
+  samples = prior.sample(key, num_samples)
+  actions, outputs, q_values = _evaluate(heads, samples)
+  alpha = heads.alpha()
   weights = boltzmann.importance_weights(q_values, alpha)
-  return Candidates(samples, actions, logits, q_values, alpha, weights)
+  return Candidates(samples, actions, outputs, q_values, weights, prior, 1.0 / alpha)
+
+
+def parametric(
+  heads: Heads, prior: ActionDistribution, key: Array, *, num_samples: int
+) -> Candidates:
+  """pi_psi: half as many draws of the arm, each with the gripper open and closed.
+
+  The gripper is summed over exactly: the two share the weight of their draw as pi
+  has it. Gradients reach psi through draws and weights, and nothing else.
+
+  Args:
+    heads: the networks at the states.
+    prior: not needed.
+    key: random key.
+    num_samples: candidates S per state, rounded down to an even number.
+  """
+  del prior
+  policy = heads.policy()
+  drawn = policy.sample(key, num_samples // 2)
+  both = jnp.stack([drawn.at[..., -1].set(gripper) for gripper in (0.0, 1.0)])
+  samples = both.reshape(-1, *drawn.shape[1:])
+  actions, outputs, q_values = _evaluate(heads.frozen(), samples)
+  log_prob = policy.log_prob(samples).reshape(both.shape[:-1])
+  weights = jax.nn.softmax(log_prob, axis=0).reshape(q_values.shape)
+  tilt = jnp.zeros(q_values.shape[1:])
+  return Candidates(
+    samples, actions, outputs, q_values, weights / drawn.shape[0], policy, tilt
+  )
+
+
+def cross_entropy(
+  heads: Heads, prior: ActionDistribution, key: Array, *, num_samples: int
+) -> Candidates:
+  """The best action that the cross-entropy method finds (QT-Opt), from draws of b.
+
+  Args:
+    heads: the networks at the states.
+    prior: the regulariser b: the first draw is its.
+    key: random key.
+    num_samples: not needed; ``CEM_SAMPLES`` belong to the method.
+
+  Returns:
+    The last draw, all weight on its best action; no gradients.
+  """
+  del num_samples
+  heads, base = heads.frozen(), jax.lax.stop_gradient(prior)
+  *keys, last = jax.random.split(key, CEM_ITERATIONS)
+  for k in keys:
+    samples = base.sample(k, CEM_SAMPLES)
+    base = _refit(samples, _evaluate(heads, samples)[2], heads.config.policy_min_prob)
+  samples = base.sample(last, CEM_SAMPLES)
+  actions, outputs, q_values = _evaluate(heads, samples)
+  best = jnp.argmax(q_values, axis=0)
+  weights = jax.nn.one_hot(best, CEM_SAMPLES, axis=0, dtype=q_values.dtype)
+  tilt = jnp.zeros(q_values.shape[1:])
+  return Candidates(samples, actions, outputs, q_values, weights, base, tilt)
+
+
+def _evaluate(heads: Heads, samples: Array) -> tuple[Array, Array, Array]:
+  """Clipped actions, outputs of the value head, Q, each [S, *b, ...]."""
+  actions = clip_action(samples)
+  outputs = heads.z(actions)
+  return actions, outputs, heads.networks.evaluation.value(outputs)
+
+
+def _refit(samples: Array, q_values: Array, min_prob: float) -> GripperGMM:
+  """One diagonal Gaussian, and a probability to close, of the best few of S draws."""
+  elites = jax.lax.top_k(jnp.moveaxis(q_values, 0, -1), CEM_ELITES)[1]
+  elites = jnp.moveaxis(elites, -1, 0)[..., None]
+  best = clip_action(jnp.take_along_axis(samples, elites, axis=0))
+  mean, std = jnp.mean(best, axis=0), jnp.std(best, axis=0)
+  close = jnp.clip(mean[..., -1], min_prob, 1.0 - min_prob)
+  joint = jnp.arange(ARM_DOF)
+  scale = jnp.zeros((*close.shape, 1, ARM_DOF, ARM_DOF))
+  std = jnp.maximum(std[..., None, :-1], CEM_MIN_STD)
+  return GripperGMM(
+    logits=jnp.zeros((*close.shape, 1)),
+    mean=mean[..., None, :-1],
+    scale_tril=scale.at[..., joint, joint].set(std),
+    gripper_logits=(jnp.log(close) - jnp.log1p(-close))[..., None],
+  )

@@ -43,6 +43,6 @@ def dual(q_values: Array, alpha: Array, *, epsilon: float) -> Array:
   return alpha * epsilon + alpha * log_mean
 
 
-def pick(key: Array, q_values: Array, alpha: Array) -> Array:
-  """Index i32[*b] of one candidate per state, drawn in proportion to exp(Q / alpha)."""
-  return jax.random.categorical(key, q_values / alpha[None], axis=0)
+def pick(key: Array, weights: Array) -> Array:
+  """Index i32[*b] of one candidate per state, drawn by f32[S, *b] weights."""
+  return jax.random.categorical(key, jnp.log(weights), axis=0)

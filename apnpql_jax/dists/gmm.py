@@ -1,4 +1,4 @@
-"""The behaviour prior: a mixture over arm velocities and a gripper command.
+"""A mixture over arm velocities and a gripper command: priors, parametric policies.
 
 Each component is a full-covariance Gaussian over the continuous part of an action
 times a Bernoulli over the gripper (paper Sec. IV-A). The density is therefore taken
@@ -32,81 +32,75 @@ class GripperGMM(struct.PyTreeNode):
   scale_tril: Array  # f32[*b, K, D, D]: lower Cholesky factor, positive diagonal
   gripper_logits: Array  # f32[*b, K]: log odds of gripper = 1
 
+  def sample(self, key: Array, num: int) -> Array:
+    """Draws actions; the continuous part is not clipped.
 
-def sample(key: Array, gmm: GripperGMM, num: int) -> Array:
-  """Draws actions; the continuous part is not clipped.
+    Args:
+      key: random key.
+      num: samples S per batch element.
 
-  Args:
-    key: random key.
-    gmm: the mixture, batch ``*b``.
-    num: samples S per batch element.
+    Returns:
+      f32[S, *b, D + 1].
+    """
+    key_arm, key_choice = jax.random.split(key)
+    batch, dim, dtype = self.mean.shape[:-2], self.mean.shape[-1], self.mean.dtype
+    noise = jax.random.normal(key_arm, (num, *batch, dim), dtype)
+    choice = jax.random.uniform(key_choice, (2, num, *batch), dtype)
+    above = jnp.cumsum(jax.nn.softmax(self.logits), axis=-1)
+    component = jnp.sum(choice[0, ..., None] >= above[None, ..., :-1], axis=-1)
+    chosen = jax.nn.one_hot(component, self.logits.shape[-1], dtype=dtype)
+    # Moving each draw by every component and then choosing beats gathering a 6x6
+    # factor per draw: K is small, and this is one batched matrix product.
+    arm = jnp.einsum("...kij,s...j->s...ki", self.scale_tril, noise) + self.mean[None]
+    arm = jnp.sum(chosen[..., None] * arm, axis=-2)
+    probability = jnp.sum(chosen * jax.nn.sigmoid(self.gripper_logits)[None], axis=-1)
+    gripper = (choice[1] < probability).astype(dtype)
+    return jnp.concatenate([arm, gripper[..., None]], axis=-1)
 
-  Returns:
-    f32[S, *b, D + 1].
-  """
-  key_arm, key_choice = jax.random.split(key)
-  batch, dim, dtype = gmm.mean.shape[:-2], gmm.mean.shape[-1], gmm.mean.dtype
-  noise = jax.random.normal(key_arm, (num, *batch, dim), dtype)
-  choice = jax.random.uniform(key_choice, (2, num, *batch), dtype)
-  above = jnp.cumsum(jax.nn.softmax(gmm.logits), axis=-1)
-  component = jnp.sum(choice[0, ..., None] >= above[None, ..., :-1], axis=-1)
-  chosen = jax.nn.one_hot(component, gmm.logits.shape[-1], dtype=dtype)
-  # Moving each draw by every component and then choosing beats gathering a 6x6
-  # factor per draw: K is small, and this is one batched matrix product.
-  arm = jnp.einsum("...kij,s...j->s...ki", gmm.scale_tril, noise) + gmm.mean[None]
-  arm = jnp.sum(chosen[..., None] * arm, axis=-2)
-  probability = jnp.sum(chosen * jax.nn.sigmoid(gmm.gripper_logits)[None], axis=-1)
-  gripper = (choice[1] < probability).astype(dtype)
-  return jnp.concatenate([arm, gripper[..., None]], axis=-1)
+  def log_prob(self, actions: Array) -> Array:
+    """Log density of unclipped actions.
 
+    Args:
+      actions: f32[S, *b, D + 1], gripper in {0, 1} last.
 
-def log_prob(gmm: GripperGMM, actions: Array) -> Array:
-  """Log density of unclipped actions.
+    Returns:
+      f32[S, *b].
+    """
+    arm, gripper = actions[..., :-1], actions[..., -1]
+    dim = arm.shape[-1]
+    # The factor is inverted once per component, not solved once per sample.
+    whitener = _invert_lower(self.scale_tril)
+    difference = arm[..., None, :] - self.mean[None]
+    white = jnp.einsum("...kij,s...kj->s...ki", whitener, difference)
+    constant = -_half_log_det(self.scale_tril) - 0.5 * dim * _LOG_2PI
+    gaussian = constant[None] - 0.5 * jnp.sum(jnp.square(white), axis=-1)
+    odds = self.gripper_logits[None]
+    bernoulli = gripper[..., None] * odds - jax.nn.softplus(odds)
+    log_weights = jax.nn.log_softmax(self.logits)[None]
+    return jax.nn.logsumexp(log_weights + gaussian + bernoulli, axis=-1)
 
-  Args:
-    gmm: the mixture, batch ``*b``.
-    actions: f32[S, *b, D + 1], gripper in {0, 1} last.
+  def component_entropy(self) -> Array:
+    """Entropy of each component in nats, f32[*b, K]: Gaussian plus Bernoulli."""
+    dim = self.mean.shape[-1]
+    gaussian = _half_log_det(self.scale_tril) + 0.5 * dim * (1.0 + _LOG_2PI)
+    odds = self.gripper_logits
+    return gaussian + jax.nn.softplus(odds) - odds * jax.nn.sigmoid(odds)
 
-  Returns:
-    f32[S, *b].
-  """
-  arm, gripper = actions[..., :-1], actions[..., -1]
-  dim = arm.shape[-1]
-  # The factor is inverted once per component, not solved once per sample.
-  whitener = _invert_lower(gmm.scale_tril)
-  difference = arm[..., None, :] - gmm.mean[None]
-  white = jnp.einsum("...kij,s...kj->s...ki", whitener, difference)
-  constant = -_half_log_det(gmm.scale_tril) - 0.5 * dim * _LOG_2PI
-  gaussian = constant[None] - 0.5 * jnp.sum(jnp.square(white), axis=-1)
-  odds = gmm.gripper_logits[None]
-  bernoulli = gripper[..., None] * odds - jax.nn.softplus(odds)
-  log_weights = jax.nn.log_softmax(gmm.logits)[None]
-  return jax.nn.logsumexp(log_weights + gaussian + bernoulli, axis=-1)
+  def entropy_bound(self) -> Array:
+    """Lower bound of the entropy in nats, from pairwise Bhattacharyya distances.
 
+    H >= sum_i w_i H_i - sum_i w_i log sum_j w_j BC_ij (Kolchinsky and Tracey 2017,
+    "Estimating Mixture Entropy with Pairwise Distances"), where the Bhattacharyya
+    coefficient BC_ij of two components is the product of the Gaussian and the
+    Bernoulli one. Exact for one component, for equal ones and for well separated ones.
 
-def component_entropy(gmm: GripperGMM) -> Array:
-  """Entropy of each component in nats, f32[*b, K]: Gaussian plus Bernoulli."""
-  dim = gmm.mean.shape[-1]
-  gaussian = _half_log_det(gmm.scale_tril) + 0.5 * dim * (1.0 + _LOG_2PI)
-  odds = gmm.gripper_logits
-  return gaussian + jax.nn.softplus(odds) - odds * jax.nn.sigmoid(odds)
-
-
-def entropy_bound(gmm: GripperGMM) -> Array:
-  """Lower bound of the entropy in nats, from pairwise Bhattacharyya distances.
-
-  H >= sum_i w_i H_i - sum_i w_i log sum_j w_j BC_ij (Kolchinsky and Tracey 2017,
-  "Estimating Mixture Entropy with Pairwise Distances"), where the Bhattacharyya
-  coefficient BC_ij of two components is the product of the Gaussian and the
-  Bernoulli one. Exact for one component, for equal ones and for well separated ones.
-
-  Returns:
-    f32[*b].
-  """
-  log_weights = jax.nn.log_softmax(gmm.logits)
-  log_overlap = log_weights[..., None, :] + _log_bhattacharyya(gmm)
-  spread = -jax.nn.logsumexp(log_overlap, axis=-1)
-  return jnp.sum(jnp.exp(log_weights) * (component_entropy(gmm) + spread), axis=-1)
+    Returns:
+      f32[*b].
+    """
+    log_weights = jax.nn.log_softmax(self.logits)
+    log_overlap = log_weights[..., None, :] + _log_bhattacharyya(self)
+    spread = -jax.nn.logsumexp(log_overlap, axis=-1)
+    return jnp.sum(jnp.exp(log_weights) * (self.component_entropy() + spread), axis=-1)
 
 
 def _log_bhattacharyya(gmm: GripperGMM) -> Array:

@@ -1,4 +1,4 @@
-"""The behaviour prior from the outputs of its head, in limits it can leave again."""
+"""Mixtures from the outputs of their heads, in limits they can leave again."""
 
 from __future__ import annotations
 
@@ -8,21 +8,22 @@ import math
 import jax
 import jax.numpy as jnp
 
-from apnpql_jax.dists import gmm
-from apnpql_jax.types import Array
+from apnpql_jax.dists.gmm import GripperGMM
+from apnpql_jax.types import ARM_DOF, Array
 
 
-def prior_from_outputs(
+def mixture_from_outputs(
   outputs: Array,
-  mean: Array,
-  close: Array,
+  primitives: Array | None,
   *,
+  num: int,
   min_std: float,
   initial_std: float,
   max_std: float,
   min_prob: float,
-) -> gmm.GripperGMM:
-  """Turns raw outputs of f^bp into the mixture around the given means.
+  diagonal: bool = False,
+) -> GripperGMM:
+  """Turns raw outputs of a head into a mixture, around the given means or its own.
 
   Each row of a Cholesky factor is a direction times the standard deviation of that
   joint. The deviation has a floor and a limit: as the means are fixed, a value that
@@ -37,18 +38,27 @@ def prior_from_outputs(
   depend on the gradient's size, and from there a sigmoid or softmax never returns.
 
   Args:
-    outputs: f32[*b, K * prior_size(D)].
-    mean: f32[*b, K, D].
-    close: f32[*b, K], predicted logit of each primitive's closing the gripper, to which
-      an output is added.
+    outputs: f32[*b, K * mixture_size(own_mean=primitives is None)].
+    primitives: f32[*b, K, 7], means in rad/s, to be kept in the action box, and logits
+      of closing the gripper, to which an output is added; None if the outputs hold the
+      means.
+    num: components K.
     min_std: floor of the standard deviation of each joint, rad/s.
     initial_std: the standard deviation where the outputs are zero, rad/s.
     max_std: limit of the standard deviation of each joint, rad/s.
     min_prob: weight of a component that stands at the floor while one of the others
       stands at the limit; smallest probability of a gripper command.
+    diagonal: leave the outputs below the diagonal of the Cholesky factor unread.
   """
-  num, dim = mean.shape[-2:]
+  dim = ARM_DOF
   outputs = outputs.reshape(*outputs.shape[:-1], num, -1)
+  surest = math.log((1.0 - min_prob) / min_prob)
+  if primitives is None:
+    mean, outputs = one_way_clip(outputs[..., :dim], -1.0, 1.0), outputs[..., dim:]
+    close = jnp.zeros(outputs.shape[:-1])
+  else:
+    mean = jnp.clip(primitives[..., :dim], -1.0, 1.0)
+    close = jnp.clip(primitives[..., dim], -surest, surest)
   below_end = dim * (dim + 1) // 2
   log_std, below, logits, gripper = jnp.split(
     outputs, [dim, below_end, below_end + 1], axis=-1
@@ -58,23 +68,22 @@ def prior_from_outputs(
   )
   rows, columns = jnp.tril_indices(dim, k=-1)
   direction = jnp.broadcast_to(jnp.eye(dim, dtype=mean.dtype), (*mean.shape, dim))
-  direction = direction.at[..., rows, columns].set(one_way_clip(below, -1.0, 1.0))
+  if not diagonal:
+    direction = direction.at[..., rows, columns].set(one_way_clip(below, -1.0, 1.0))
   length = jnp.sqrt(jnp.sum(jnp.square(direction), axis=-1, keepdims=True))
   widest = 0.5 * math.log((1.0 - (num - 1) * min_prob) / min_prob)
   logits = one_way_clip(logits[..., 0], -widest, widest)
-  surest = math.log((1.0 - min_prob) / min_prob)
-  close = jnp.clip(close, -surest, surest) + gripper[..., 0]
-  return gmm.GripperGMM(
+  return GripperGMM(
     logits=jax.nn.log_softmax(logits),
     mean=mean,
     scale_tril=jnp.exp(log_std)[..., None] / length * direction,
-    gripper_logits=one_way_clip(close, -surest, surest),
+    gripper_logits=one_way_clip(close + gripper[..., 0], -surest, surest),
   )
 
 
-def prior_size(dim: int) -> int:
-  """Outputs per component: Cholesky factor, weight, gripper."""
-  return dim * (dim + 1) // 2 + 2
+def mixture_size(*, own_mean: bool) -> int:
+  """Outputs per component: mean if its own, Cholesky factor, weight, gripper."""
+  return ARM_DOF * own_mean + ARM_DOF * (ARM_DOF + 1) // 2 + 2
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1, 2))

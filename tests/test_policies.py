@@ -1,0 +1,119 @@
+"""Policies as weighted candidates: their weights, densities and search."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from batches import random_batch
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from apnpql_jax.agents import policies, projections
+from apnpql_jax.agents.evaluation import TD0
+from apnpql_jax.agents.networks import GROUPS, Heads, make_networks
+from apnpql_jax.config import AgentConfig
+from apnpql_jax.dists.action import UniformBox
+
+CONFIG = AgentConfig(hidden=(8, 8), feature_dim=8, policy_samples=400)
+STATES = 16
+
+
+@dataclasses.dataclass(frozen=True)
+class KnownValues(Heads):
+  """Real networks, but Q(s, a) = 1 - |a - goal|^2, half a point more if closed."""
+
+  goal: float = 0.5
+
+  def z(self, actions):
+    far = jnp.sum(jnp.square(actions[..., :6] - self.goal), axis=-1)
+    return (1.0 - far + 0.5 * actions[..., 6])[..., None]
+
+
+@pytest.fixture(scope="module")
+def heads() -> KnownValues:
+  networks = make_networks(CONFIG, GROUPS, TD0(CONFIG))
+  seen = random_batch(0, STATES).observation_tm1
+  params = networks.init(jax.random.key(0), seen)
+  params["policy"]["out"]["bias"] = 0.2 * jnp.sin(jnp.arange(29.0))
+  bound = networks.at(params, seen)
+  return KnownValues(bound.networks, bound.params, bound.phi)
+
+
+def test_density_of_q_is_the_prior_times_the_importance_weights(heads):
+  prior = heads.prior()
+  q = policies.non_parametric(heads, prior, jax.random.key(1), num_samples=50)
+  ratio = q.log_prob(q.samples, q.q_values) - prior.log_prob(q.samples)
+  np.testing.assert_allclose(jnp.exp(ratio), 50.0 * q.weights, rtol=1e-4)
+  np.testing.assert_allclose(q.weights.sum(0), 1.0, rtol=1e-5)
+
+
+def test_parametric_policy_sums_over_the_gripper(heads):
+  policy = heads.policy()
+  pi = policies.parametric(heads, policy, jax.random.key(2), num_samples=400)
+  assert pi.samples.shape == (400, STATES, 7)
+  closed = jnp.sum(pi.weights * pi.samples[..., 6], axis=0)
+  expected = jax.nn.sigmoid(policy.gripper_logits[:, 0])
+  np.testing.assert_allclose(closed, expected, rtol=1e-4)
+  mean = jnp.sum(pi.weights[..., None] * pi.samples[..., :6], axis=0)
+  error = (mean - policy.mean[:, 0]) / (policy.scale_tril[:, 0].std() + 0.3)
+  assert np.abs(error).max() < 5.0 / np.sqrt(200)
+  np.testing.assert_allclose(
+    pi.log_prob(pi.samples, pi.q_values), policy.log_prob(pi.samples), rtol=1e-5
+  )
+
+
+def test_cross_entropy_method_comes_nearer_than_its_first_draw(heads):
+  prior = UniformBox((STATES,), 6)
+  best = policies.cross_entropy(heads, prior, jax.random.key(3), num_samples=0)
+  one = policies.non_parametric(heads, prior, jax.random.key(3), num_samples=128)
+  assert best.samples.shape == (64, STATES, 7)
+  np.testing.assert_array_equal(best.weights.sum(0), 1.0)
+  np.testing.assert_array_equal(best.value, best.q_values.max(0))
+  chosen = jnp.sum(best.weights[..., None] * best.actions, axis=0)
+  assert np.all(chosen[:, 6] == 1.0)
+  # As many draws without a refit find less.
+  assert np.mean(best.value) > np.mean(one.q_values.max(0)) + 0.1
+
+
+def test_uniform_box_is_uniform():
+  box = UniformBox((2,), 6)
+  drawn = box.sample(jax.random.key(0), 20_000)
+  draws = np.asarray(drawn)
+  assert draws.shape == (20_000, 2, 7)
+  np.testing.assert_allclose(draws[..., :6].mean((0, 1)), 0.0, atol=0.02)
+  np.testing.assert_allclose(draws[..., :6].var((0, 1)), 1.0 / 3.0, atol=0.01)
+  assert set(np.unique(draws[..., 6])) == {0.0, 1.0}
+  assert draws[..., 6].mean() == pytest.approx(0.5, abs=0.01)
+  # 64 for the arm, two commands: the density integrates to one.
+  assert np.exp(box.log_prob(drawn[:1])) * 2.0**7 == pytest.approx(1.0, rel=1e-5)
+  np.testing.assert_allclose(box.entropy_bound(), 7.0 * np.log(2.0), rtol=1e-6)
+
+
+def test_reverse_kl_of_a_gaussian_and_a_uniform_prior_is_exact(heads):
+  step = projections.reverse_kl(heads, UniformBox((STATES,), 6), jax.random.key(4))
+  expected = 7.0 * np.log(2.0) - heads.policy().entropy_bound()
+  assert np.mean(step.kl - expected) == pytest.approx(0.0, abs=0.1)
+
+
+@pytest.mark.parametrize("project", [projections.forward_kl, projections.reverse_kl])
+def test_a_projection_brings_the_policy_to_the_better_actions(heads, project):
+  """Descent on psi alone moves mean and gripper towards what Q likes."""
+  prior = UniformBox((STATES,), 6)
+
+  def loss(psi, key):
+    moved = dataclasses.replace(heads, params={**heads.params, "policy": psi})
+    return jnp.mean(project(moved, prior, key).losses["loss/policy"])
+
+  def descend(psi, key):
+    slope = jax.grad(loss)(psi, key)
+    return jax.tree.map(lambda x, g: x - 0.05 * g, psi, slope), None
+
+  keys = jax.random.split(jax.random.key(5), 200)
+  psi, _ = jax.jit(lambda p: jax.lax.scan(descend, p, keys))(heads.params["policy"])
+  after = dataclasses.replace(heads, params={**heads.params, "policy": psi}).policy()
+  before = heads.policy()
+  far = [np.abs(x.mean - heads.goal).mean() for x in (before, after)]
+  assert far[1] < 0.5 * far[0]
+  assert np.all(after.gripper_logits > before.gripper_logits)
