@@ -13,6 +13,7 @@ import json
 import math
 import os
 from pathlib import Path
+import signal
 import sys
 from typing import Any
 
@@ -34,7 +35,8 @@ Json = dict[str, Any]
 def main(argv: Sequence[str] | None = None) -> int:
   """Runs one command line; returns the exit code.
 
-  0 success, 2 bad input (one line on standard error), 130 stopped by the user.
+  0 success; 2 bad input; 3 a run that had to stop (disk full, values not finite); 130
+  Ctrl-C and 143 SIGTERM, with a run saved. All but 0 with one line on standard error.
   """
   args = list(sys.argv[1:] if argv is None else argv)
   try:
@@ -56,8 +58,14 @@ def main(argv: Sequence[str] | None = None) -> int:
   except ConfigError as error:
     print("apnpql: " + " ".join(str(error).split()), file=sys.stderr)
     return 2
+  except runs.RunStopped as stop:
+    print(f"apnpql: {stop}", file=sys.stderr, flush=True)
+    if stop.code == runs.FAILED:
+      # Threads of a save that failed half-way may wait for each other for minutes.
+      os._exit(stop.code)
+    return stop.code
   except KeyboardInterrupt:
-    return 130
+    return runs.INTERRUPTED + signal.SIGINT
   except BrokenPipeError:  # The reader of our output left, as `head` does.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     return 0

@@ -18,7 +18,6 @@ from apnpql_jax import checkpoint, run_folder
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config import EnvConfig
 from apnpql_jax.env import Env, make_env
-from apnpql_jax.iteration import initial_state
 from apnpql_jax.metrics import wilson_interval
 from apnpql_jax.rollout import Policy, agent_policy, expert_policy
 from apnpql_jax.types import Array
@@ -49,6 +48,7 @@ def make_player(env: Env, make_policy: Callable[[Any], Policy]) -> Player:
       state, outcome, running, key = carry
       key, policy_key, env_key = jax.random.split(key, 3)
       state = env.step(state, policy(state, policy_key), env_key)
+      running &= state.faults == 0  # What a world does after a fault is not counted.
       solved = running & state.timestep.terminated
       outcome = Episodes(outcome.success | solved, outcome.length + running)
       return state, outcome, running & ~state.timestep.last, key
@@ -122,8 +122,13 @@ def evaluate_run(
   step = checkpoint.check(run_dir, step, config=config)
   env_config = dataclasses.replace(config.env, backend=backend or config.env.backend)
   env, agent = make_env(env_config), make_agent(config.agent)
-  example = jax.eval_shape(lambda: initial_state(config, env, agent))
-  learner = checkpoint.restore(run_dir, step, example, config=config).learner
+  example = jax.eval_shape(
+    lambda: agent.init(
+      jax.random.key(0), env.reset(jnp.zeros(1, int)).timestep.observation
+    )
+  )
+  restored = checkpoint.restore(run_dir, step, {"learner": example}, config=config)
+  learner = restored.items["learner"]
   play = make_player(env, lambda params: agent_policy(agent, params, greedy=False))
   figures = play_held_out(env, play, learner.params, episodes=episodes, seed=seed)
   return {

@@ -32,10 +32,12 @@ _POSITIVE = (
   "agent.feature_dim agent.max_grad_norm agent.patch_channels agent.conv_channels "
   "agent.ap_delta agent.min_std agent.initial_alpha agent.min_alpha "
   "replay.capacity replay.batch_size total_steps rollout_length "
-  "updates_per_iteration eval_every eval_episodes checkpoint_every keep_checkpoints"
+  "updates_per_iteration eval_every eval_episodes checkpoint_every keep_checkpoints "
+  "max_skipped_updates"
 ).split()
 _NOT_NEGATIVE = (
-  "agent.lambda_ap agent.m_step_delay replay.expert_steps replay.expert_noise seed"
+  "agent.lambda_ap agent.m_step_delay replay.expert_steps replay.expert_noise seed "
+  "save_replay_every"
 ).split()
 
 
