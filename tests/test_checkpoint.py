@@ -271,12 +271,14 @@ def test_a_full_disk_leaves_the_checkpoints_before_untouched(tmp_path: Path):
       writer.wait()
   finally:
     resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-  # What was written of it is gone, and the next save works.
+  writer.close()
+  # What was written of it is gone, and a run that goes on can save.
   assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["1"]
   _assert_same_bits(_restore(tmp_path, None, _state()), _state(1))
-  writer.save(3, {"state": _state(3)})
-  assert writer.finished(wait=True)["checkpoint/mib"] > 0
-  writer.close()
+  with CheckpointWriter(tmp_path, CONFIG, keep=1, resume_step=1) as writer:
+    writer.save(3, {"state": _state(3)})
+    figures = writer.finished(wait=True)
+  assert figures["checkpoint/mib"] > 0 and figures["checkpoint/wall_s"] > 0
   assert checkpoint.all_steps(tmp_path) == [3]
 
 
