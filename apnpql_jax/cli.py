@@ -1,4 +1,4 @@
-"""The command ``apnpql``: train, evaluate, collect, list. Parses and calls, no more.
+"""The command ``apnpql``: train, evaluate, collect, repeat, list. Parses and calls, no more.
 
 JAX, MuJoCo and everything built on them are imported inside the commands, so that
 help and refusals of bad input are instant.
@@ -27,7 +27,7 @@ from apnpql_jax.config import (
   check_name,
   validate,
 )
-from apnpql_jax.options import Collect, Evaluate, List, Train, parse
+from apnpql_jax.options import Collect, Evaluate, List, Repeat, Train, parse
 
 Json = dict[str, Any]
 
@@ -141,6 +141,19 @@ def collect(args: Collect, argv: Sequence[str]) -> Json:
   # The expert acts on privileged poses: drawing images would only cost time.
   env = dataclasses.replace(env, task=args.task, backend=args.backend, obs="state")
   return evaluate_expert(env, episodes=args.episodes, seed=args.seed, noise=args.noise)
+
+
+def repeat(args: Repeat, argv: Sequence[str]) -> Json:
+  """Names what was not finite in an update that a run stopped for."""
+  del argv
+  if not args.file:
+    raise ConfigError("repeat needs a file: apnpql repeat RUN/faults/step_<n>.npz")
+  path = Path(args.file).absolute()
+  runs.load_run_config(path.parents[1])
+
+  from apnpql_jax import faults
+
+  return faults.repeat(path)
 
 
 def list_names(args: List, argv: Sequence[str]) -> Json:
@@ -282,5 +295,6 @@ _COMMANDS: dict[str, tuple[type[Any], Callable[[Any, Sequence[str]], Json], Any]
   "train": (Train, train, _show_figures),
   "evaluate": (Evaluate, evaluate, _show_figures),
   "collect": (Collect, collect, _show_figures),
+  "repeat": (Repeat, repeat, _show_figures),
   "list": (List, list_names, _show_names),
 }

@@ -61,8 +61,9 @@ def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
       sample_key, learn_key = jax.random.split(key)
       batch = sample(ring, state.expert_replay, sample_key)
       updated, metrics = agent.update(learner, batch, learn_key)
-      # A gradient that is not finite leaves moments and parameters that are not.
-      ok = all_finite(updated)
+      # A gradient that is not finite leaves moments and parameters that are not; a
+      # reward that is not, however, can get lost in the limits of the projection.
+      ok = all_finite((batch, updated))
       learner = jax.tree.map(functools.partial(jnp.where, ok), updated, learner)
       faults = Faults(
         in_a_row=jnp.where(ok, 0, faults.in_a_row + 1),

@@ -107,6 +107,17 @@ class Collect:
 
 
 @dataclasses.dataclass(frozen=True)
+class Repeat:
+  """Repeats an update that was not finite: apnpql repeat RUN/faults/step_<n>.npz."""
+
+  file: tyro.conf.Positional[str] = ""
+  """What a run wrote when it stopped for such updates; it must lie where it was."""
+
+  json: _Flag = False
+  """Print one JSON object on standard output and nothing else there."""
+
+
+@dataclasses.dataclass(frozen=True)
 class List:
   """Names the tasks, presets, algorithms and backends."""
 
