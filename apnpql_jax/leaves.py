@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+import math
 from typing import Any
 import zlib
 
@@ -24,6 +25,11 @@ def fill(example: Any, arrays: Mapping[str, Any]) -> Any:
     KeyError: one is missing.
   """
   return jax.tree_util.tree_map_with_path(lambda p, _: arrays[_name(p)], example)
+
+
+def nbytes(tree: Any) -> int:
+  """Bytes that the leaves take; ShapeDtypeStructs do."""
+  return sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(tree))
 
 
 def describe(tree: Any) -> dict[str, str]:

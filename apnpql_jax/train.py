@@ -10,7 +10,6 @@ import contextlib
 import dataclasses
 import functools
 import logging
-import math
 from pathlib import Path
 import signal
 import sys
@@ -19,7 +18,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from apnpql_jax import checkpoint, codec, faults, memory, replay, run_folder, runs
+from apnpql_jax import (
+  checkpoint,
+  codec,
+  faults,
+  leaves,
+  memory,
+  replay,
+  run_folder,
+  runs,
+)
 from apnpql_jax.agents.learner import Agent, make_agent
 from apnpql_jax.checkpoint_writer import CheckpointWriter
 from apnpql_jax.config import TrainConfig
@@ -116,7 +124,7 @@ def _start(
   env, agent = make_env(config.env), make_agent(config.agent)
   build = functools.partial(initial_state, config, env, agent)
   example = jax.eval_shape(build)
-  memory.check_memory(_nbytes(example), "the training state")
+  memory.check_memory(leaves.nbytes(example), "the training state")
   if resume:
     folder = run_folder.open_run(run_dir)
     for change in run_folder.changed_versions(folder):
@@ -147,10 +155,10 @@ def _loop(config, iteration, state, reporter, saver, caught) -> TrainState:
     # Who sends a signal may not wait for an evaluation before the state is safe.
     if not caught and (done or _passed(before, step, config.eval_every)):
       rate = reporter.evaluate(step, state, last=done)
-    last = done or bool(caught) or saver.empty
+    last = done or bool(caught)
     whole = _passed(before, step, config.save_replay_every or config.checkpoint_every)
     if last or whole or _passed(before, step, config.checkpoint_every):
-      items = _to_items(state, whole=last or whole)
+      items = _to_items(state, whole=last or whole or saver.empty)
       saver.save(step, items, success_rate=rate)
   return state
 
@@ -219,7 +227,3 @@ def _say(text: str) -> None:
 
 def _passed(before: int, now: int, every: int) -> bool:
   return now // every > before // every
-
-
-def _nbytes(tree: Any) -> int:
-  return sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(tree))

@@ -40,6 +40,9 @@ _NOT_NEGATIVE = (
   "save_replay_every"
 ).split()
 
+_AT_MOST = {"env.bank_rows": 1 << 20, "agent.num_atoms": 10_000}
+"""What is computed on the host before memory can be checked."""
+
 
 def validate(
   config: TrainConfig,
@@ -95,6 +98,9 @@ def _validate_ranges(config: TrainConfig) -> None:
   for name in _NOT_NEGATIVE:
     if values[name] < 0:
       raise ConfigError(f"{name}={values[name]} must not be negative")
+  for name, most in _AT_MOST.items():
+    if values[name] > most:
+      raise ConfigError(f"{name}={values[name]} must be at most {most}")
   if config.env.bank_rows < MIN_BANK_ROWS:
     raise ConfigError(
       f"env.bank_rows={config.env.bank_rows} must be at least {MIN_BANK_ROWS}: a "

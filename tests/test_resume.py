@@ -41,12 +41,13 @@ def test_a_run_killed_at_random_moments_ends_as_if_nothing_had_been(tmp_path, ki
   for _ in range(kills):
     process = tiny.start(run, "--total-steps", "100000", said=said)
     _wait_for_progress(process, said)
-    time.sleep(rng.uniform(0.0, 2.0))
+    time.sleep(rng.uniform(0.0, 5.0))
     process.kill()
     process.wait()
     reached = tiny.rows(run)[-1]["step"]
     lost.append(reached - (checkpoint.latest_step(run) or 0))
     saving += any((run / "checkpoints").glob("*tmp*"))
+    print(f"lost {lost[-1]} of {reached}", flush=True)
   # An interval, and what is trained while a checkpoint is being written.
   assert max(lost) <= 2 * tiny.CONFIG.checkpoint_every
   print(f"{kills} kills, {saving} while saving; environment steps lost: {lost}")
