@@ -1,4 +1,4 @@
-"""The command ``apnpql``: train, evaluate, collect, repeat, list. Parses and calls, no more.
+"""The command ``apnpql``: parses and calls, no more.
 
 JAX, MuJoCo and everything built on them are imported inside the commands, so that
 help and refusals of bad input are instant.
@@ -27,7 +27,7 @@ from apnpql_jax.config import (
   check_name,
   validate,
 )
-from apnpql_jax.options import Collect, Evaluate, List, Repeat, Train, parse
+from apnpql_jax.options import Collect, Convert, Evaluate, List, Repeat, Train, parse
 
 Json = dict[str, Any]
 
@@ -140,7 +140,33 @@ def collect(args: Collect, argv: Sequence[str]) -> Json:
 
   # The expert acts on privileged poses: drawing images would only cost time.
   env = dataclasses.replace(env, task=args.task, backend=args.backend, obs="state")
-  return evaluate_expert(env, episodes=args.episodes, seed=args.seed, noise=args.noise)
+  settings = {"episodes": args.episodes, "seed": args.seed, "noise": args.noise}
+  figures = evaluate_expert(env, **settings)
+  if args.save is None:
+    return figures
+  from apnpql_jax import demonstrations
+
+  return figures | demonstrations.save_expert(args.save, env, **settings)
+
+
+def convert(args: Convert, argv: Sequence[str]) -> Json:
+  """Makes demonstrations of recorded joint trajectories."""
+  del argv
+  if not args.out:
+    raise ConfigError(
+      "convert needs three names: apnpql convert RECORDING.npz TASK OUT.npz"
+    )
+  from apnpql_jax import demonstrations, recordings, tasks
+
+  check_name("task", args.task, tasks.task_names())
+  period_s = EnvConfig().control_period_s
+  if args.task in presets.preset_names():
+    period_s = presets.load_preset(args.task).env.control_period_s
+  scene = tasks.make_task(args.task).scene
+  demos = recordings.convert(Path(args.recording), scene, period_s=period_s)
+  return demonstrations.save(
+    Path(args.out), demos, task=args.task, control_period_s=period_s
+  )
 
 
 def repeat(args: Repeat, argv: Sequence[str]) -> Json:
@@ -295,6 +321,7 @@ _COMMANDS: dict[str, tuple[type[Any], Callable[[Any, Sequence[str]], Json], Any]
   "train": (Train, train, _show_figures),
   "evaluate": (Evaluate, evaluate, _show_figures),
   "collect": (Collect, collect, _show_figures),
+  "convert": (Convert, convert, _show_figures),
   "repeat": (Repeat, repeat, _show_figures),
   "list": (List, list_names, _show_names),
 }

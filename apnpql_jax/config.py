@@ -169,6 +169,10 @@ class ReplayConfig:
   batch_size: int = 64
   """Transitions per update, both replays together."""
 
+  demonstrations: str = ""
+  """File of demonstrations to fill the expert replay from, in place of the scripted
+  expert; docs/demonstrations.md has the format."""
+
   expert_noise: float = 0.1
   """Standard deviation of the noise on the expert's joint velocities, rad/s."""
 

@@ -107,15 +107,37 @@ class Env:
     broken = ~state.timestep.last & ~self._sound(state, action, moved)
     reset = state.timestep.last | broken
     rows = jax.random.randint(key, reset.shape, 0, self.bank_split)
-    merge = functools.partial(_where, reset)
+    merged = jax.tree.map(functools.partial(_where, reset), self._initial(rows), moved)
+    arrived = self.visit(state, merged, self._bank.targets[rows], reset)
+    return arrived.replace(faults=state.faults + broken)
+
+  def visit(
+    self, before: EnvState, now: PhysicsState, targets: Array, fresh: Array
+  ) -> EnvState:
+    """The instant that follows on ``before`` when the worlds are as ``now``.
+
+    Args:
+      before: [worlds, ...].
+      now: [worlds, ...].
+      targets: f32[worlds, 3, 6], joint targets of episodes that begin, rad.
+      fresh: bool[worlds], where they do.
+    """
     return self._arrive(
-      jax.tree.map(merge, self._initial(rows), moved),
-      merge(self._bank.targets[rows], state.targets),
-      elapsed=jnp.where(reset, 0, state.elapsed + 1),
-      fresh=reset,
-      history=state.timestep.observation.robot,
-      faults=state.faults + broken,
+      now,
+      _where(fresh, targets, before.targets),
+      elapsed=jnp.where(fresh, 0, before.elapsed + 1),
+      fresh=fresh,
+      history=before.timestep.observation.robot,
+      faults=before.faults,
     )
+
+  def tool_targets(self, state: PhysicsState) -> tuple[Array, Array]:
+    """See ``Task.tool_targets``."""
+    return self.task.tool_targets(state, self._kinematics(state))
+
+  def variant(self, rows: Array) -> Array:
+    """i32[worlds]: of the scene, at rows of the bank."""
+    return self._bank.variant[rows]
 
   def expert_action(self, state: EnvState) -> Array:
     """f32[worlds, 7]: what the task's scripted expert does now."""

@@ -125,8 +125,10 @@ def _rollout_metrics(chunk: Slot) -> Metrics:
   }
 
 
-def initial_state(config: TrainConfig, env: Env, agent: Agent) -> TrainState:
-  """The state before the first iteration, with the expert's replay filled."""
+def initial_state(
+  config: TrainConfig, env: Env, agent: Agent, expert_replay: Replay | None = None
+) -> TrainState:
+  """The state before the first iteration; collects the expert's replay if None."""
   key, *keys = jax.random.split(jax.random.key(config.seed), 5)
   rows = jax.random.randint(keys[0], (config.env.worlds,), 0, env.bank_split)
   worlds = jax.jit(env.reset)(rows)
@@ -136,7 +138,7 @@ def initial_state(config: TrainConfig, env: Env, agent: Agent) -> TrainState:
     learner=jax.jit(agent.init)(keys[1], worlds.timestep.observation),
     env=worlds,
     replay=replay.create(slot, length, config.env.worlds),
-    expert_replay=collect_expert(config, env, keys[2]),
+    expert_replay=expert_replay or collect_expert(config, env, keys[2]),
     key=key,
     env_steps=jnp.zeros((), jnp.int32),
     faults=Faults(in_a_row=jnp.zeros((), jnp.int32), key=keys[3]),

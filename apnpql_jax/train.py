@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from apnpql_jax import (
   checkpoint,
   codec,
+  demonstrations,
   faults,
   leaves,
   memory,
@@ -132,8 +133,14 @@ def _start(
   if saved:
     state = _restore(config, run_dir, example)
     return Start(env, agent, folder, state, int(state.env_steps))
-  _say("collecting the expert's replay")
-  state = build()
+  expert_replay = None
+  if path := config.replay.demonstrations:
+    demos = demonstrations.load(Path(path), env)
+    _say(f"{demos.instants} instants of {path} for {config.replay.expert_steps} slots")
+    expert_replay = demonstrations.make_replay(demos, config, env)
+  else:
+    _say("collecting the expert's replay")
+  state = build(expert_replay)
   if resume:
     _say("it was stopped before its first checkpoint, and begins again")
     return Start(env, agent, folder, state, 0)

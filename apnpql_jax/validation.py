@@ -171,6 +171,11 @@ def _validate_replay(config: TrainConfig, memory_bytes: int | None) -> None:
     raise ConfigError(
       "replay.expert_steps=0 leaves nothing to draw; use replay.expert_share=0"
     )
+  if replay.demonstrations and not replay.expert_steps:
+    raise ConfigError(
+      "replay.expert_steps=0 leaves no room for replay.demonstrations="
+      f"{replay.demonstrations}"
+    )
   if replay.capacity % per_iteration:
     raise ConfigError(
       f"replay.capacity={replay.capacity} must be a multiple of env.worlds * "
