@@ -86,10 +86,12 @@ def load(path: Path, env: Env) -> Demonstrations:
   expected = (FORMAT, VERSION, env.task.name, env.config.control_period_s)
   for name, value in zip(("format", "version", "task"), expected, strict=False):
     if str(arrays[name]) != str(value):
-      raise ConfigError(f"{path} has {name} {arrays[name]!s:.40}, not {value}")
+      raise ConfigError(f"{path} has {name} {_shown(arrays[name])}, not {value}")
   period = arrays["control_period_s"]
   if period.shape or period.dtype.kind != "f" or abs(period - expected[3]) > 1e-6:
-    raise ConfigError(f"{path} has control_period_s {period}, not {expected[3]}")
+    raise ConfigError(
+      f"{path} has control_period_s {_shown(period)}, not {expected[3]}"
+    )
   try:
     demos = Demonstrations(**{name: arrays[name] for name in fields})
     check(demos, env.task.scene)
@@ -104,7 +106,7 @@ def check(demos: Demonstrations, scene: Scene) -> None:
   Raises:
     ConfigError: names the array and the first instant that is wrong.
   """
-  model, n = scene.model, len(demos.first)
+  model, n = scene.model, demos.first.size
   variants = min((len(v) for v in scene.variants.values()), default=1)
   shapes = {
     "qpos": ("f", (n, model.nq)),
@@ -246,6 +248,10 @@ def _solve_targets(demos: Demonstrations, rows: np.ndarray, env: Env) -> np.ndar
 
 def _free_joints(model: mujoco.MjModel) -> np.ndarray:
   return model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
+
+
+def _shown(array: np.ndarray) -> str:
+  return " ".join(str(array).split())[:40]
 
 
 def _refuse(name: str, what: str, wrong: np.ndarray) -> None:
