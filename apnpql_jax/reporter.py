@@ -12,7 +12,7 @@ from apnpql_jax.config import TrainConfig
 from apnpql_jax.env import Env
 from apnpql_jax.evaluate import make_player, play_held_out
 from apnpql_jax.iteration import TrainState
-from apnpql_jax.metrics import MetricWriter, plot_curve, read_rows
+from apnpql_jax.metrics import MetricWriter, plot_curve, read_evaluations
 from apnpql_jax.progress import TrainProgress
 from apnpql_jax.recording import record_episodes
 from apnpql_jax.rollout import agent_policy
@@ -66,7 +66,7 @@ class Reporter:
     row = {f"eval/{name}": value for name, value in figures.items() if name != "ci95"}
     row["eval/ci95_low"], row["eval/ci95_high"] = figures["ci95"]
     self._writer.write(step, row | {"eval/wall_s": time.monotonic() - began})
-    plot_curve(read_rows(folder.metrics_jsonl), folder.curve, title=config.env.task)
+    plot_curve(read_evaluations(folder.path), folder.curve, title=config.env.task)
     if config.video and last:
       record_episodes(
         self._env, self._policy(params), folder.videos / f"step_{step:08d}.mp4"
