@@ -59,11 +59,15 @@ def save(
   Raises:
     ConfigError: it cannot be written.
   """
-  head = {"format": FORMAT, "version": VERSION, "task": task}
+  arrays: dict[str, Any] = {
+    "format": FORMAT,
+    "version": VERSION,
+    "task": task,
+    "control_period_s": control_period_s,
+    **demos._asdict(),
+  }
   try:
-    np.savez_compressed(
-      path, **head, control_period_s=control_period_s, **demos._asdict()
-    )
+    np.savez_compressed(path, **arrays)
   except OSError as error:
     raise ConfigError(f"cannot write {path}: {error}") from None
   episodes = int(demos.first.sum())

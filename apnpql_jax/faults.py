@@ -49,8 +49,8 @@ def write(path: Path, config: TrainConfig, state: TrainState) -> None:
   sample_key, learn_key = jax.random.split(state.faults.key)
   batch = make_sample(config)(state.replay, state.expert_replay, sample_key)
   update = {"learner": state.learner, "batch": batch, "key": learn_key}
-  arrays = leaves.named(leaves.to_plain(update))
-  np.savez(path, **{name: np.asarray(array) for name, array in arrays.items()})
+  arrays: dict[str, Any] = jax.device_get(leaves.named(leaves.to_plain(update)))
+  np.savez(path, **arrays)
 
 
 def repeat(path: Path) -> dict[str, list[str]]:
@@ -70,7 +70,7 @@ def repeat(path: Path) -> dict[str, list[str]]:
     batch = leaves.fill(_example_batch(arrays), _below("batch/", arrays))
     learner = jax.eval_shape(agent.init, jax.random.key(0), batch.observation_tm1)
     learner = leaves.fill(learner, _below("learner/", arrays))
-    key = jax.random.wrap_key_data(arrays["key"])
+    key = jax.random.wrap_key_data(jnp.asarray(arrays["key"]))
     after, metrics = jax.jit(agent.update)(learner, batch, key)
   except (KeyError, TypeError, ValueError) as error:
     text = " ".join(str(error).split())[:200]
@@ -96,6 +96,7 @@ def _example_batch(arrays: dict[str, np.ndarray]) -> Transition:
 
   def observation(name: str) -> Observation:
     fields = Observation.__dataclass_fields__
+    held: dict[str, Any]
     held = {f: 0 if f"batch/{name}/{f}" in arrays else None for f in fields}
     return Observation(**held)
 

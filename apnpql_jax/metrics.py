@@ -148,7 +148,7 @@ class MetricWriter:
     self.close()
 
   def _rows_until(self, step: int | None) -> list[Row]:
-    """Rows of the newest file that has any up to ``step``; it becomes the present one."""
+    """Rows up to ``step`` of the newest file with any; it becomes the present one."""
     rows = read_rows(self._jsonl)
     if step is None:
       return rows

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from pathlib import Path
 import zipfile
+import zlib
 
 import numpy as np
 
 from apnpql_jax.config import ConfigError
 
-_ERRORS = (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, RuntimeError)
-_ERRORS += (NotImplementedError, zipfile.zlib.error)
+_ERRORS = (OSError, ValueError, EOFError, KeyError, RuntimeError, MemoryError)
+_ERRORS += (NotImplementedError, zipfile.BadZipFile, zlib.error)
+"""What zipfile and NumPy raise at archives that are none."""
 
 
 def read(path: Path, *, limit: int) -> dict[str, np.ndarray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 from hypothesis import HealthCheck, given, settings, strategies as st
 import jax
@@ -132,8 +133,9 @@ def test_other_files_are_refused_by_name(path, demos, env):
   st.lists(st.integers(0, 5), max_size=3),
 )
 def test_no_array_in_place_of_another_gets_through(path, env, name, value, shape):
-  arrays = dict(np.load(path, allow_pickle=False))
-  np.savez(path, **(arrays | {name: np.full(shape, value)}))
+  arrays: dict[str, Any] = dict(np.load(path, allow_pickle=False))
+  changed: dict[str, Any] = arrays | {name: np.full(shape, value)}
+  np.savez(path, **changed)
   try:
     demonstrations.load(path, env)
   except ConfigError as error:
@@ -144,8 +146,8 @@ def test_no_array_in_place_of_another_gets_through(path, env, name, value, shape
     np.savez(path, **arrays)
 
 
-def _recording(env: Env, demos: Demonstrations) -> dict[str, np.ndarray]:
-  """The recorded episodes as somebody would have measured them, three times as often."""
+def _recording(env: Env, demos: Demonstrations) -> dict[str, Any]:
+  """The episodes as somebody would have measured them, three times as often."""
   free, _ = env.task.scene.free_joint("plate")
   finger = env.task.scene.gripper_qpos
   times, parts, period = [], [], 0.15
@@ -195,7 +197,9 @@ def test_what_a_recording_cannot_tell_is_asked_for(tmp_path, demos, env):
   whole, path = _recording(env, demos), tmp_path / "recording.npz"
 
   def refused(match: str, **changes: np.ndarray | None) -> None:
-    changed = {k: v for k, v in (whole | changes).items() if v is not None}
+    changed: dict[str, Any] = {
+      k: v for k, v in (whole | changes).items() if v is not None
+    }
     np.savez(path, **changed)
     with pytest.raises(ConfigError, match=match):
       recordings.convert(path, env.task.scene, period_s=0.15)

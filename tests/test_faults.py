@@ -35,8 +35,8 @@ def built(env) -> tuple[Any, TrainState]:
   """The compiled iteration, and the state after three of them."""
   agent = make_agent(CONFIG.agent)
   state = initial_state(CONFIG, env, agent)
-  iteration = make_iteration(CONFIG, env, agent).lower(state)
-  iteration = iteration.compile(compiler_options=tiny.FAST_COMPILE)
+  jitted: Any = make_iteration(CONFIG, env, agent)
+  iteration = jitted.lower(state).compile(compiler_options=tiny.FAST_COMPILE)
   for _ in range(3):
     state, metrics = iteration(state)
   assert metrics["faults/worlds"] == metrics["faults/updates"] == 0
@@ -188,7 +188,7 @@ def test_after_several_the_run_stops_and_the_update_can_be_repeated(
   told = capsys.readouterr().out.splitlines()
   assert [line.split()[0] for line in told if "reward_t" in line] == ["batch"]
   # With rewards of zero the very same update is finite.
-  arrays = dict(np.load(file, allow_pickle=False))
+  arrays: dict[str, Any] = dict(np.load(file, allow_pickle=False))
   np.savez(file, **(arrays | {"batch/reward_t": 0 * arrays["batch/discount_t"]}))
   assert not any(faults.repeat(file).values())
   np.savez(file, **{k: v for k, v in arrays.items() if k != "key"})
