@@ -1,13 +1,15 @@
-"""Values that are not finite, put into real states of a real run, and what comes of it.
+"""The iteration and the state it moves on: repeatable, saved whole, and safe from NaN.
 
-One compiled iteration serves all tests of this file.
+One compiled iteration serves all tests. Values that are not finite are put into real
+states; the slow variants do everything for other algorithms, engines and observations.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,32 +17,51 @@ import numpy as np
 import pytest
 import tiny
 
-from apnpql_jax import cli, faults, replay, run_folder, runs
+from apnpql_jax import checkpoint, cli, faults, replay, run_folder, runs, train
+from apnpql_jax.agents.algorithms import ALGORITHMS
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import ConfigError
+from apnpql_jax.checkpoint_writer import CheckpointWriter
+from apnpql_jax.config import ConfigError, TrainConfig
 from apnpql_jax.env import Env, make_env
 from apnpql_jax.iteration import TrainState, initial_state, make_iteration, make_sample
 
-CONFIG = dataclasses.replace(tiny.CONFIG, max_skipped_updates=2)
-WORLDS, LENGTH = CONFIG.env.worlds, CONFIG.rollout_length
+WORLDS, LENGTH = tiny.CONFIG.env.worlds, tiny.CONFIG.rollout_length
 
 
-@pytest.fixture(scope="module")
-def env() -> Env:
-  return make_env(CONFIG.env)
+class Built(NamedTuple):
+  """What is expensive to make."""
+
+  config: TrainConfig
+  env: Env
+  iteration: Callable  # compiled; donates its argument
+  state: TrainState  # after three iterations
 
 
-@pytest.fixture(scope="module")
-def built(env) -> tuple[Any, TrainState]:
-  """The compiled iteration, and the state after three of them."""
-  agent = make_agent(CONFIG.agent)
-  state = initial_state(CONFIG, env, agent)
-  jitted: Any = make_iteration(CONFIG, env, agent)
+def _variants() -> list[Any]:
+  first, *others = ALGORITHMS
+  variants = [(first, "native", "pixels"), (first, "mjx", "state")]
+  variants += [(name, "native", "state") for name in others]
+  slow = [pytest.param(v, marks=pytest.mark.slow, id="-".join(v)) for v in variants]
+  return [pytest.param((first, "native", "state"), id=first), *slow]
+
+
+@pytest.fixture(scope="module", params=_variants())
+def built(request) -> Built:
+  algorithm, backend, obs = request.param
+  config = dataclasses.replace(
+    tiny.CONFIG,
+    env=dataclasses.replace(tiny.CONFIG.env, backend=backend, obs=obs),
+    agent=dataclasses.replace(tiny.CONFIG.agent, algorithm=algorithm),
+    max_skipped_updates=2,
+  )
+  env, agent = make_env(config.env), make_agent(config.agent)
+  state = initial_state(config, env, agent)
+  jitted: Any = make_iteration(config, env, agent)
   iteration = jitted.lower(state).compile(compiler_options=tiny.FAST_COMPILE)
   for _ in range(3):
     state, metrics = iteration(state)
   assert metrics["faults/worlds"] == metrics["faults/updates"] == 0
-  return iteration, state
+  return Built(config, env, iteration, state)
 
 
 @pytest.fixture(autouse=True)
@@ -51,17 +72,19 @@ def elsewhere(tmp_path, monkeypatch):
 
 @pytest.fixture
 def iteration(built):
-  """The iteration on a copy: it donates its argument."""
-  return lambda state: built[0](jax.tree.map(jnp.copy, state))
+  """The iteration on a copy, which spares the original from being donated."""
+  return lambda state: built.iteration(jax.tree.map(jnp.copy, state))
 
 
 @pytest.fixture
 def state(built) -> TrainState:
-  return built[1]
+  return built.state
 
 
 def _bits(tree: Any) -> list[bytes]:
-  return [np.asarray(x).tobytes() for x in jax.tree.leaves(tree)]
+  keys = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
+  plain = jax.tree.map(lambda x: jax.random.key_data(x) if keys(x) else x, tree)
+  return [np.asarray(x).tobytes() for x in jax.tree.leaves(plain)]
 
 
 def _break_world(state: TrainState, field: str, value: float) -> TrainState:
@@ -94,12 +117,46 @@ def _poison_learner(state: TrainState) -> TrainState:
 
 def test_an_iteration_is_a_function_of_its_state(iteration, state):
   first, again = iteration(state), iteration(state)
-  keys = [jax.random.key_data(out[0].key).tobytes() for out in (first, again)]
-  assert keys[0] == keys[1]
-  plain = [out[0].replace(key=0, faults=0) for out in (first, again)]
-  assert _bits(plain[0]) == _bits(plain[1]) and _bits(first[1]) == _bits(again[1])
-  other = iteration(state.replace(key=jax.random.key(99)))[0]
-  assert _bits(other.learner) != _bits(first[0].learner)
+  assert _bits(first) == _bits(again)
+  other = iteration(state.replace(key=jax.random.key(99)))
+  assert _bits(other[0].learner) != _bits(first[0].learner)
+
+
+def _save(run: Path, built: Built, *states: tuple[TrainState, bool]) -> None:
+  with CheckpointWriter(run, built.config, keep=9) as writer:
+    for state, whole in states:
+      writer.save(int(state.env_steps), train._to_items(state, whole=whole))
+
+
+def test_a_state_that_was_saved_goes_on_bit_by_bit(built, iteration, tmp_path):
+  _save(tmp_path, built, (built.state, True))
+  example = jax.eval_shape(lambda: jax.tree.map(jnp.copy, built.state))
+  restored = train._restore(built.config, tmp_path, example)
+  straight = built.state
+  assert _bits(restored) == _bits(straight) and len(_bits(straight)) > 60
+  for _ in range(2):
+    straight, told = iteration(straight)
+    restored, again = iteration(restored)
+  assert _bits(restored) == _bits(straight) and _bits(told) == _bits(again)
+
+
+def test_without_its_replay_a_state_goes_on_with_an_older_one(
+  built, iteration, tmp_path, capsys
+):
+  before, after = built.state, iteration(built.state)[0]
+  _save(tmp_path, built, (before, True), (after, False))
+  assert checkpoint.all_steps(tmp_path) == [24, 32]
+  example = jax.eval_shape(lambda: jax.tree.map(jnp.copy, after))
+  restored = train._restore(built.config, tmp_path, example)
+  assert "its replay is that of step 24" in capsys.readouterr().err
+  assert _bits(restored.replace(replay=0)) == _bits(after.replace(replay=0))
+  assert int(restored.replay.cursor) == int(before.replay.cursor)
+  # What is added next does not follow on the newest instant, which is now an end.
+  held, kept = (x.replay.slots.timestep.truncated for x in (restored, before))
+  newest = int(before.replay.cursor) - 1
+  assert held[newest].all() and not kept[newest].any()
+  np.testing.assert_array_equal(held[:newest], kept[:newest])
+  assert jnp.isfinite(iteration(restored)[1]["loss/q"])
 
 
 @pytest.mark.parametrize(
@@ -107,7 +164,7 @@ def test_an_iteration_is_a_function_of_its_state(iteration, state):
   [("qpos", np.nan), ("qvel", np.inf), ("qvel", 1e12), ("qacc_warmstart", np.nan)],
 )
 def test_a_broken_world_starts_again_and_its_episode_is_never_drawn(
-  iteration, state, field, value
+  built, iteration, state, field, value
 ):
   after, metrics = iteration(_break_world(state, field, value))
   clean, _ = iteration(state)
@@ -127,7 +184,7 @@ def test_a_broken_world_starts_again_and_its_episode_is_never_drawn(
     after.env.physics.qpos[others], clean.env.physics.qpos[others]
   )
   keys = jax.random.split(jax.random.key(0), 64)
-  sample = jax.jit(make_sample(CONFIG))
+  sample = jax.jit(make_sample(built.config))
   for key in keys:
     batch = sample(after.replay, after.expert_replay, key)
     drawn = jax.tree.leaves((batch.observation_tm1, batch.observation_t))
@@ -137,19 +194,20 @@ def test_a_broken_world_starts_again_and_its_episode_is_never_drawn(
     assert not (starts[:, None, :] == robot[None]).all(-1).any()
 
 
-def test_the_engine_alone_would_not_have_told(env, state):
-  """C MuJoCo goes on from its default pose, finite, when a world is not."""
-  broken = _break_world(state, "qpos", np.nan).env.physics
-  moved = env.physics.step(broken, jnp.zeros((WORLDS, 6)), jnp.zeros(WORLDS))
+def test_the_native_engine_alone_would_not_have_told(built, state):
+  """C MuJoCo goes on from its default pose, finite; an action it takes for none."""
+  if built.env.physics.name != "native":
+    pytest.skip("MJX goes on with what is not a number")
+  step, sound = built.env.physics.step, built.env._sound
+  action = jnp.zeros((WORLDS, 7))
+  broken = _break_world(state, "qpos", np.nan).env
+  moved = step(broken.physics, action[:, :6], action[:, 6])
   assert jnp.isfinite(moved.qpos).all()
-
-
-def test_an_action_that_is_not_finite_breaks_its_world(env, state):
-  action = jnp.zeros((WORLDS, 7)).at[2, 3].set(jnp.nan)
-  moved = env.physics.step(state.env.physics, action[:, :6], action[:, 6])
-  # The engine takes it for no torque at all.
+  np.testing.assert_array_equal(sound(broken, action, moved), [True, False, True, True])
+  action = action.at[2, 3].set(jnp.nan)
+  moved = step(state.env.physics, action[:, :6], action[:, 6])
   assert jnp.isfinite(moved.qpos).all()
-  sound = env._sound(state.env, action, moved)
+  sound = sound(state.env, action, moved)
   np.testing.assert_array_equal(sound, [True, True, False, True])
 
 
@@ -171,14 +229,14 @@ def test_an_update_that_is_not_finite_is_skipped_and_counted(iteration, state, p
 
 
 def test_after_several_the_run_stops_and_the_update_can_be_repeated(
-  iteration, state, tmp_path: Path, capsys
+  built, iteration, state, tmp_path: Path, capsys
 ):
-  folder = run_folder.create(tmp_path / "run", CONFIG)
-  faults.check(CONFIG, state, folder)
+  folder = run_folder.create(tmp_path / "run", built.config)
+  faults.check(built.config, state, folder)
   assert not folder.faults.exists()
   after, _ = iteration(_poison_replay(state))
   with pytest.raises(runs.RunStopped, match="2 updates in a row") as stop:
-    faults.check(CONFIG, after, folder)
+    faults.check(built.config, after, folder)
   assert stop.value.code == runs.FAILED
   (file,) = folder.faults.iterdir()
   # The message ends with a command line that works as it stands.
