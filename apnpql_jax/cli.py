@@ -1,4 +1,4 @@
-"""The command ``apnpql``: train, evaluate, collect, list. Parses and calls, no more.
+"""The command ``apnpql``: parses and calls, no more.
 
 JAX, MuJoCo and everything built on them are imported inside the commands, so that
 help and refusals of bad input are instant.
@@ -13,6 +13,7 @@ import json
 import math
 import os
 from pathlib import Path
+import signal
 import sys
 from typing import Any
 
@@ -26,7 +27,7 @@ from apnpql_jax.config import (
   check_name,
   validate,
 )
-from apnpql_jax.options import Collect, Evaluate, List, Train, parse
+from apnpql_jax.options import Collect, Convert, Evaluate, List, Repeat, Train, parse
 
 Json = dict[str, Any]
 
@@ -34,7 +35,8 @@ Json = dict[str, Any]
 def main(argv: Sequence[str] | None = None) -> int:
   """Runs one command line; returns the exit code.
 
-  0 success, 2 bad input (one line on standard error), 130 stopped by the user.
+  0 success; 2 bad input; 3 a run that had to stop (disk full, values not finite); 130
+  Ctrl-C and 143 SIGTERM, with a run saved. All but 0 with one line on standard error.
   """
   args = list(sys.argv[1:] if argv is None else argv)
   try:
@@ -56,8 +58,14 @@ def main(argv: Sequence[str] | None = None) -> int:
   except ConfigError as error:
     print("apnpql: " + " ".join(str(error).split()), file=sys.stderr)
     return 2
+  except runs.RunStopped as stop:
+    print(f"apnpql: {stop}", file=sys.stderr, flush=True)
+    if stop.code == runs.FAILED:
+      # Threads of a save that failed half-way may wait for each other for minutes.
+      os._exit(stop.code)
+    return stop.code
   except KeyboardInterrupt:
-    return 130
+    return runs.INTERRUPTED + signal.SIGINT
   except BrokenPipeError:  # The reader of our output left, as `head` does.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     return 0
@@ -132,7 +140,46 @@ def collect(args: Collect, argv: Sequence[str]) -> Json:
 
   # The expert acts on privileged poses: drawing images would only cost time.
   env = dataclasses.replace(env, task=args.task, backend=args.backend, obs="state")
-  return evaluate_expert(env, episodes=args.episodes, seed=args.seed, noise=args.noise)
+  settings = {"episodes": args.episodes, "seed": args.seed, "noise": args.noise}
+  figures = evaluate_expert(env, **settings)
+  if args.save is None:
+    return figures
+  from apnpql_jax import demonstrations
+
+  return figures | demonstrations.save_expert(args.save, env, **settings)
+
+
+def convert(args: Convert, argv: Sequence[str]) -> Json:
+  """Makes demonstrations of recorded joint trajectories."""
+  del argv
+  if not args.out:
+    raise ConfigError(
+      "convert needs three names: apnpql convert RECORDING.npz TASK OUT.npz"
+    )
+  from apnpql_jax import demonstrations, recordings, tasks
+
+  check_name("task", args.task, tasks.task_names())
+  period_s = EnvConfig().control_period_s
+  if args.task in presets.preset_names():
+    period_s = presets.load_preset(args.task).env.control_period_s
+  scene = tasks.make_task(args.task).scene
+  demos = recordings.convert(Path(args.recording), scene, period_s=period_s)
+  return demonstrations.save(
+    Path(args.out), demos, task=args.task, control_period_s=period_s
+  )
+
+
+def repeat(args: Repeat, argv: Sequence[str]) -> Json:
+  """Names what was not finite in an update that a run stopped for."""
+  del argv
+  if not args.file:
+    raise ConfigError("repeat needs a file: apnpql repeat RUN/faults/step_<n>.npz")
+  path = Path(args.file).absolute()
+  runs.load_run_config(path.parents[1])
+
+  from apnpql_jax import faults
+
+  return faults.repeat(path)
 
 
 def list_names(args: List, argv: Sequence[str]) -> Json:
@@ -274,5 +321,7 @@ _COMMANDS: dict[str, tuple[type[Any], Callable[[Any, Sequence[str]], Json], Any]
   "train": (Train, train, _show_figures),
   "evaluate": (Evaluate, evaluate, _show_figures),
   "collect": (Collect, collect, _show_figures),
+  "convert": (Convert, convert, _show_figures),
+  "repeat": (Repeat, repeat, _show_figures),
   "list": (List, list_names, _show_names),
 }

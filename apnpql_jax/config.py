@@ -201,6 +201,10 @@ class ReplayConfig:
   batch_size: int = 64
   """Transitions per update, both replays together."""
 
+  demonstrations: str = ""
+  """File of demonstrations to fill the expert replay from, in place of the scripted
+  expert; docs/demonstrations.md has the format."""
+
   expert_noise: float = 0.1
   """Standard deviation of the noise on the expert's joint velocities, rad/s."""
 
@@ -241,6 +245,14 @@ class TrainConfig:
 
   keep_checkpoints: int = 2
   """Newest checkpoints kept on disk."""
+
+  save_replay_every: int = 0
+  """Environment steps between two checkpoints that hold the replay too; 0: all do. A
+  run resumed from one without goes on with an older replay, so not bit by bit."""
+
+  max_skipped_updates: int = 100
+  """Updates in a row that may be skipped, because a gradient is not finite, before
+  the run stops."""
 
   video: bool = True
   """Write a video of evaluation episodes."""

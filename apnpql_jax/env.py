@@ -2,7 +2,8 @@
 
 All functions are pure over ``EnvState`` and run inside jit; the world axis comes
 first. A step taken from a terminal instant resets that world to a random row of the
-bank and ignores the action, so terminal observations reach the replay.
+bank and ignores the action, so terminal observations reach the replay. A world whose
+state is no longer finite starts again in the same way, and is counted.
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ class EnvState(struct.PyTreeNode):
   targets: Array  # f32[worlds, 3, 6]: joint targets of the primitives, rad
   elapsed: Array  # i32[worlds]: control periods since the reset
   timestep: TimeStep  # [worlds, ...]: the present instant
+  faults: Array  # i32[worlds]: times a world was reset for not being finite
 
 
 class Env:
@@ -90,6 +92,7 @@ class Env:
       elapsed=jnp.zeros(count, jnp.int32),
       fresh=jnp.ones(count, bool),
       history=jnp.zeros((count, HISTORY * 7)),
+      faults=jnp.zeros(count, jnp.int32),
     )
 
   def step(self, state: EnvState, action: Array, key: Array) -> EnvState:
@@ -100,17 +103,41 @@ class Env:
       action: f32[worlds, 7], see ``types.ACTION_DIM``.
       key: draws the rows of worlds that start again.
     """
-    reset = state.timestep.last
     moved = self.physics.step(state.physics, action[:, :6], action[:, 6])
+    broken = ~state.timestep.last & ~self._sound(state, action, moved)
+    reset = state.timestep.last | broken
     rows = jax.random.randint(key, reset.shape, 0, self.bank_split)
-    merge = functools.partial(_where, reset)
+    merged = jax.tree.map(functools.partial(_where, reset), self._initial(rows), moved)
+    arrived = self.visit(state, merged, self._bank.targets[rows], reset)
+    return arrived.replace(faults=state.faults + broken)
+
+  def visit(
+    self, before: EnvState, now: PhysicsState, targets: Array, fresh: Array
+  ) -> EnvState:
+    """The instant that follows on ``before`` when the worlds are as ``now``.
+
+    Args:
+      before: [worlds, ...].
+      now: [worlds, ...].
+      targets: f32[worlds, 3, 6], joint targets of episodes that begin, rad.
+      fresh: bool[worlds], where they do.
+    """
     return self._arrive(
-      jax.tree.map(merge, self._initial(rows), moved),
-      merge(self._bank.targets[rows], state.targets),
-      elapsed=jnp.where(reset, 0, state.elapsed + 1),
-      fresh=reset,
-      history=state.timestep.observation.robot,
+      now,
+      _where(fresh, targets, before.targets),
+      elapsed=jnp.where(fresh, 0, before.elapsed + 1),
+      fresh=fresh,
+      history=before.timestep.observation.robot,
+      faults=before.faults,
     )
+
+  def tool_targets(self, state: PhysicsState) -> tuple[Array, Array, Array]:
+    """See ``Task.tool_targets``."""
+    return self.task.tool_targets(state, self._kinematics(state))
+
+  def variant(self, rows: Array) -> Array:
+    """i32[worlds]: of the scene, at rows of the bank."""
+    return self._bank.variant[rows]
 
   def expert_action(self, state: EnvState) -> Array:
     """f32[worlds, 7]: what the task's scripted expert does now."""
@@ -131,6 +158,17 @@ class Env:
       bank.variant[rows],
     )
 
+  def _sound(self, before: EnvState, action: Array, moved: PhysicsState) -> Array:
+    """bool[worlds]: everything is finite, and the engine has not started over.
+
+    C MuJoCo puts a world that is not finite back to its default pose without a word;
+    its clock then shows less time than has passed.
+    """
+    seen = jax.tree.leaves((before.physics, before.targets, action, moved))
+    finite = [jnp.isfinite(x).all(tuple(range(1, x.ndim))) for x in seen]
+    passed = moved.time - before.physics.time
+    return jnp.stack(finite).all(0) & (passed > 0.5 * self.config.control_period_s)
+
   def _arrive(
     self,
     state: PhysicsState,
@@ -139,6 +177,7 @@ class Env:
     elapsed: Array,
     fresh: Array,
     history: Array,
+    faults: Array,
   ) -> EnvState:
     """Judges, labels and observes the instant the worlds have come to."""
     kinematics = self._kinematics(state)
@@ -157,7 +196,7 @@ class Env:
         [tracking.follow(targets, q[:, None]), close[..., None]], axis=-1
       ),
     )
-    return EnvState(state, targets, elapsed, timestep)
+    return EnvState(state, targets, elapsed, timestep, faults)
 
   def _observe(self, state, kinematics, fresh, history) -> Observation:
     scene = self.task.scene

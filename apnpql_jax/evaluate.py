@@ -6,6 +6,7 @@ from collections.abc import Callable
 import dataclasses
 import math
 from pathlib import Path
+import sys
 import time
 from typing import Any
 
@@ -14,11 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax import checkpoint, run_folder
+from apnpql_jax import checkpoint, leaves, memory, run_folder
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config import EnvConfig
 from apnpql_jax.env import Env, make_env
-from apnpql_jax.iteration import initial_state
 from apnpql_jax.metrics import wilson_interval
 from apnpql_jax.rollout import Policy, agent_policy, expert_policy
 from apnpql_jax.types import Array
@@ -49,6 +49,7 @@ def make_player(env: Env, make_policy: Callable[[Any], Policy]) -> Player:
       state, outcome, running, key = carry
       key, policy_key, env_key = jax.random.split(key, 3)
       state = env.step(state, policy(state, policy_key)[0], env_key)
+      running &= state.faults == 0  # What a world does after a fault is not counted.
       solved = running & state.timestep.terminated
       outcome = Episodes(outcome.success | solved, outcome.length + running)
       return state, outcome, running & ~state.timestep.last, key
@@ -119,11 +120,18 @@ def evaluate_run(
   """
   began = time.monotonic()
   config = run_folder.open_run(run_dir).config
-  step = checkpoint.check(run_dir, step, config=config)
+  checkpoint.check(run_dir, step, config=config)
   env_config = dataclasses.replace(config.env, backend=backend or config.env.backend)
   env, agent = make_env(env_config), make_agent(config.agent)
-  example = jax.eval_shape(lambda: initial_state(config, env, agent))
-  learner = checkpoint.restore(run_dir, step, example, config=config).learner
+  example = jax.eval_shape(
+    lambda rows: agent.init(jax.random.key(0), env.reset(rows).timestep.observation),
+    jnp.zeros(1, jnp.int32),
+  )
+  memory.check_memory(leaves.nbytes(example), "the learner")
+  found = checkpoint.restore(run_dir, step, {"learner": example}, config=config)
+  for line in found.damaged:
+    print(line, file=sys.stderr)
+  learner = found.items["learner"]
   play = make_player(env, lambda params: agent_policy(agent, params, greedy=False))
   figures = play_held_out(env, play, learner.params, episodes=episodes, seed=seed)
   return {
@@ -131,7 +139,7 @@ def evaluate_run(
     "algorithm": config.agent.algorithm,
     "backend": env.physics.name,
     **figures,
-    "checkpoint_step": step,
+    "checkpoint_step": found.step,
     "wall_s": time.monotonic() - began,
   }
 

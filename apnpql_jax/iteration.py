@@ -16,7 +16,14 @@ from apnpql_jax.config import TrainConfig
 from apnpql_jax.env import Env, EnvState
 from apnpql_jax.replay import Replay
 from apnpql_jax.rollout import agent_policy, expert_policy, rollout
-from apnpql_jax.types import ACTION_DIM, Array, Metrics, Slot
+from apnpql_jax.types import ACTION_DIM, Array, Metrics, Slot, Transition
+
+
+class Faults(struct.PyTreeNode):
+  """Updates that were skipped because something in them was not finite."""
+
+  in_a_row: Array  # i32[]: those at the end of what has been done so far
+  key: Array  # typed PRNG key of the last one, from which it can be repeated
 
 
 class TrainState(struct.PyTreeNode):
@@ -28,6 +35,7 @@ class TrainState(struct.PyTreeNode):
   expert_replay: Replay | None
   key: Array  # typed PRNG key
   env_steps: Array  # i32[]: environment steps done, summed over worlds
+  faults: Faults
 
 
 Iteration = Callable[[TrainState], tuple[TrainState, Metrics]]
@@ -38,7 +46,57 @@ def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
 
   The state is donated: the caller must go on with the one returned.
   """
-  sample = functools.partial(
+  sample = make_sample(config, agent)
+
+  def iteration(state: TrainState) -> tuple[TrainState, Metrics]:
+    key, rollout_key, update_key = jax.random.split(state.key, 3)
+    policy = agent_policy(agent, state.learner.params, greedy=False)
+    worlds, chunk = rollout(
+      env, policy, state.env, rollout_key, length=config.rollout_length
+    )
+    ring = _remember(state.replay, state.env, worlds, chunk)
+
+    def update(carry: tuple[LearnerState, Faults], key: Array) -> Any:
+      learner, faults = carry
+      sample_key, learn_key = jax.random.split(key)
+      batch = sample(ring, state.expert_replay, sample_key)
+      updated, metrics = agent.update(learner, batch, learn_key)
+      # A gradient that is not finite leaves moments and parameters that are not; a
+      # reward that is not, however, can get lost in the limits of the projection.
+      ok = all_finite((batch, updated))
+      learner = jax.tree.map(functools.partial(jnp.where, ok), updated, learner)
+      faults = Faults(
+        in_a_row=jnp.where(ok, 0, faults.in_a_row + 1),
+        key=jnp.where(ok, faults.key, key),
+      )
+      return (learner, faults), (metrics, ok)
+
+    keys = jax.random.split(update_key, config.updates_per_iteration)
+    (learner, faults), (metrics, ok) = jax.lax.scan(
+      update, (state.learner, state.faults), keys
+    )
+    metrics = {name: jnp.mean(x, where=ok) for name, x in metrics.items()}
+    metrics |= _rollout_metrics(chunk) | {
+      "faults/worlds": (worlds.faults - state.env.faults).sum(),
+      "faults/updates": (~ok).sum(),
+      "faults/updates_in_a_row": faults.in_a_row,
+    }
+    steps = config.rollout_length * config.env.worlds
+    return state.replace(
+      learner=learner,
+      env=worlds,
+      replay=ring,
+      key=key,
+      env_steps=state.env_steps + steps,
+      faults=faults,
+    ), metrics
+
+  return jax.jit(iteration, donate_argnums=0)
+
+
+def make_sample(config: TrainConfig, agent: Agent) -> Callable[..., Transition]:
+  """(replay, expert replay, key) -> the batch of one update, [B, ...]."""
+  return functools.partial(
     replay.sample_mixed,
     batch_size=config.replay.batch_size,
     expert_share=config.replay.expert_share,
@@ -47,32 +105,17 @@ def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
     windows=agent.networks.evaluation.windows,
   )
 
-  def iteration(state: TrainState) -> tuple[TrainState, Metrics]:
-    key, rollout_key, update_key = jax.random.split(state.key, 3)
-    policy = agent_policy(agent, state.learner.params, greedy=False)
-    worlds, chunk = rollout(
-      env, policy, state.env, rollout_key, length=config.rollout_length
-    )
-    ring = replay.add(state.replay, chunk)
 
-    def update(learner: LearnerState, key: Array) -> tuple[LearnerState, Metrics]:
-      sample_key, learn_key = jax.random.split(key)
-      batch = sample(ring, state.expert_replay, sample_key)
-      return agent.update(learner, batch, learn_key)
+def all_finite(tree: Any) -> Array:
+  """bool[]: no leaf holds a NaN or an infinity."""
+  return jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(tree)]).all()
 
-    keys = jax.random.split(update_key, config.updates_per_iteration)
-    learner, metrics = jax.lax.scan(update, state.learner, keys)
-    metrics = jax.tree.map(jnp.mean, metrics) | _rollout_metrics(chunk)
-    steps = config.rollout_length * config.env.worlds
-    return state.replace(
-      learner=learner,
-      env=worlds,
-      replay=ring,
-      key=key,
-      env_steps=state.env_steps + steps,
-    ), metrics
 
-  return jax.jit(iteration, donate_argnums=0)
+def _remember(ring: Replay, before: EnvState, after: EnvState, chunk: Slot) -> Replay:
+  """Adds a chunk; of a world that broke in it, the episode and the rest is excluded."""
+  steps = before.elapsed + chunk.action.shape[0]
+  broken = after.faults > before.faults
+  return replay.exclude(replay.add(ring, chunk), jnp.where(broken, steps, 0))
 
 
 def _rollout_metrics(chunk: Slot) -> Metrics:
@@ -83,8 +126,10 @@ def _rollout_metrics(chunk: Slot) -> Metrics:
   }
 
 
-def initial_state(config: TrainConfig, env: Env, agent: Agent) -> TrainState:
-  """The state before the first iteration, with the expert's replay filled."""
+def initial_state(
+  config: TrainConfig, env: Env, agent: Agent, expert_replay: Replay | None = None
+) -> TrainState:
+  """The state before the first iteration; collects the expert's replay if None."""
   key, *keys = jax.random.split(jax.random.key(config.seed), 5)
   rows = jax.random.randint(keys[0], (config.env.worlds,), 0, env.bank_split)
   worlds = jax.jit(env.reset)(rows)
@@ -94,9 +139,10 @@ def initial_state(config: TrainConfig, env: Env, agent: Agent) -> TrainState:
     learner=jax.jit(agent.init)(keys[1], worlds.timestep.observation),
     env=worlds,
     replay=replay.create(slot, length, config.env.worlds),
-    expert_replay=collect_expert(config, env, keys[2]),
+    expert_replay=expert_replay or collect_expert(config, env, keys[2]),
     key=key,
     env_steps=jnp.zeros((), jnp.int32),
+    faults=Faults(in_a_row=jnp.zeros((), jnp.int32), key=keys[3]),
   )
 
 
@@ -123,7 +169,8 @@ def collect_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:
     row_key, play_key = jax.random.split(key)
     rows = jax.random.randint(row_key, (worlds,), 0, env.bank_split)
     state = env.reset(rows)
-    _, chunk = rollout(env, policy, state, play_key, length=length)
-    return replay.add(replay.create(example_slot(state), length, worlds), chunk)
+    after, chunk = rollout(env, policy, state, play_key, length=length)
+    ring = replay.create(example_slot(state), length, worlds)
+    return _remember(ring, state, after, chunk)
 
   return collect(key)

@@ -3,26 +3,54 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+import math
 from typing import Any
+import zlib
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+
+
+def named(tree: Any) -> dict[str, Any]:
+  """Path of each leaf -> leaf."""
+  leaves = jax.tree_util.tree_leaves_with_path(tree)
+  return {_name(path): leaf for path, leaf in leaves}
+
+
+def fill(example: Any, arrays: Mapping[str, Any]) -> Any:
+  """The tree of ``example`` with the ``arrays`` that ``named`` gives of it.
+
+  Raises:
+    KeyError: one is missing.
+  """
+  return jax.tree_util.tree_map_with_path(lambda p, _: arrays[_name(p)], example)
+
+
+def nbytes(tree: Any) -> int:
+  """Bytes that the leaves take; ShapeDtypeStructs do."""
+  return sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(tree))
 
 
 def describe(tree: Any) -> dict[str, str]:
   """Path of each leaf -> dtype and shape, such as ``uint8[4, 72, 96, 3]``."""
-  return {
-    _name(path): f"{leaf.dtype}{list(leaf.shape)}"
-    for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
-  }
+  return {path: f"{leaf.dtype}{list(leaf.shape)}" for path, leaf in named(tree).items()}
 
 
 def key_impls(tree: Any) -> dict[str, str]:
   """Path of each typed PRNG key -> name of its generator."""
   return {
-    _name(path): str(jax.random.key_impl(leaf))
-    for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
+    path: str(jax.random.key_impl(leaf))
+    for path, leaf in named(tree).items()
     if _is_key(leaf)
+  }
+
+
+def checksums(tree: Any) -> dict[str, int]:
+  """Path of each leaf -> CRC-32 of its bytes, typed keys by their data."""
+  return {
+    path: zlib.crc32(np.ascontiguousarray(_key_data(leaf)).reshape(-1).view(np.uint8))
+    for path, leaf in named(tree).items()
   }
 
 

@@ -24,6 +24,9 @@ WALL = "time/wall_s"
 SUCCESS = "eval/success_rate"
 EPISODES = "eval/episodes"
 
+MAX_BYTES = 32 << 20
+"""Size at which ``metrics.jsonl`` is put aside as ``metrics.<n>.jsonl``."""
+
 Row = dict[str, float | None]
 
 
@@ -72,7 +75,8 @@ class MetricWriter:
   """Appends rows to ``metrics.jsonl`` and ``metrics.csv``, each whole on disk at once.
 
   The JSONL file is the record, the CSV file a view of it: a metric seen for the first
-  time adds a column, and the CSV is written anew with the old rows empty there.
+  time adds a column, and the CSV is written anew with the old rows empty there. Both
+  are put aside when they have become large, the oldest as number 1.
   """
 
   def __init__(
@@ -82,6 +86,7 @@ class MetricWriter:
     resume_step: int | None = None,
     sinks: Sequence[Sink] = (),
     clock: Callable[[], float] = time.monotonic,
+    max_bytes: int = MAX_BYTES,
   ):
     """Opens the files, keeping the rows there are.
 
@@ -90,15 +95,14 @@ class MetricWriter:
       resume_step: rows of later steps are dropped; the run will do them again.
       sinks: more places to write to; closed with this one.
       clock: seconds; only differences count.
+      max_bytes: of ``metrics.jsonl``, above which a new one is begun.
 
     Raises:
       ConfigError: there are rows that cannot be read.
     """
     self._jsonl, self._csv = run_dir / "metrics.jsonl", run_dir / "metrics.csv"
-    self._sinks, self._clock = tuple(sinks), clock
-    rows = read_rows(self._jsonl)
-    if resume_step is not None:
-      rows = [row for row in rows if (row[STEP] or 0) <= resume_step]
+    self._sinks, self._clock, self._max_bytes = tuple(sinks), clock, max_bytes
+    rows = self._rows_until(resume_step)
     # Written anew, because a killed process may have left half a line.
     write_text(self._jsonl, "".join(_json_line(row) for row in rows))
     self._columns = list(dict.fromkeys([STEP, WALL, *(k for row in rows for k in row)]))
@@ -124,6 +128,11 @@ class MetricWriter:
     else:
       with self._csv.open("a", encoding="utf-8", newline="") as file:
         csv.DictWriter(file, self._columns).writerow(row)
+    if self._jsonl.stat().st_size > self._max_bytes:
+      number = len(metric_files(self._jsonl.parent))
+      for path in (self._jsonl, self._csv):
+        path.rename(_numbered(path, number))
+      self._write_csv([])
     for sink in self._sinks:
       sink.write(step, numbers)
 
@@ -138,12 +147,42 @@ class MetricWriter:
   def __exit__(self, *exception: object) -> None:
     self.close()
 
+  def _rows_until(self, step: int | None) -> list[Row]:
+    """Rows up to ``step`` of the newest file with any; it becomes the present one."""
+    rows = read_rows(self._jsonl)
+    if step is None:
+      return rows
+    kept = [row for row in rows if (row[STEP] or 0) <= step]
+    if not kept and (number := len(metric_files(self._jsonl.parent)) - 1) > 0:
+      _numbered(self._csv, number).unlink(missing_ok=True)
+      _numbered(self._jsonl, number).replace(self._jsonl)
+      return self._rows_until(step)
+    return kept
+
   def _write_csv(self, rows: Sequence[Row]) -> None:
     text = io.StringIO(newline="")
     table = csv.DictWriter(text, self._columns)
     table.writeheader()
     table.writerows(rows)
     write_text(self._csv, text.getvalue())
+
+
+def metric_files(run_dir: Path) -> list[Path]:
+  """The JSONL files of a run: those put aside, oldest first, then the present one."""
+  present, aside = run_dir / "metrics.jsonl", []
+  while (path := _numbered(present, len(aside) + 1)).exists():
+    aside.append(path)
+  return [*aside, present]
+
+
+def read_evaluations(run_dir: Path) -> list[Row]:
+  """Rows of all evaluations of a run, oldest first."""
+  rows = (row for path in metric_files(run_dir) for row in read_rows(path))
+  return [row for row in rows if row.get(SUCCESS) is not None]
+
+
+def _numbered(path: Path, number: int) -> Path:
+  return path.with_suffix(f".{number}{path.suffix}")
 
 
 def read_rows(path: Path) -> list[Row]:

@@ -102,6 +102,39 @@ class Collect:
   noise: float = 0.0
   """Standard deviation of the noise on the expert's joint velocities, rad/s."""
 
+  save: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="")] = None
+  """Also write that many episodes, from reset states of training, to this file of
+  demonstrations."""
+
+  json: _Flag = False
+  """Print one JSON object on standard output and nothing else there."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Convert:
+  """Makes demonstrations of a recording: apnpql convert RECORDING.npz TASK OUT.npz."""
+
+  recording: tyro.conf.Positional[str] = ""
+  """Joint trajectories with the poses of the objects; docs/demonstrations.md has the
+  format."""
+
+  task: tyro.conf.Positional[str] = ""
+  """Task they show; `apnpql list` names them."""
+
+  out: tyro.conf.Positional[str] = ""
+  """File to write, for --replay.demonstrations."""
+
+  json: _Flag = False
+  """Print one JSON object on standard output and nothing else there."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Repeat:
+  """Repeats an update that was not finite: apnpql repeat RUN/faults/step_<n>.npz."""
+
+  file: tyro.conf.Positional[str] = ""
+  """What a run wrote when it stopped for such updates; it must lie where it was."""
+
   json: _Flag = False
   """Print one JSON object on standard output and nothing else there."""
 

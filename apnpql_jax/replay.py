@@ -81,6 +81,20 @@ def add(replay: Replay, chunk: Slot) -> Replay:
   )
 
 
+def exclude(replay: Replay, steps: Array) -> Replay:
+  """Marks the newest ``steps`` (i32[worlds]) slots of each world as truncated.
+
+  No transition starts at a slot that is last, and none reaches beyond one, so that
+  an episode excluded from its first slot on is never drawn.
+  """
+  length = replay.slots.action.shape[0]
+  age = (replay.cursor - 1 - jnp.arange(length)) % length
+  timestep = replay.slots.timestep
+  truncated = timestep.truncated | (age[:, None] < steps[None, :])
+  slots = replay.slots.replace(timestep=timestep.replace(truncated=truncated))
+  return replay.replace(slots=slots)
+
+
 def can_sample(replay: Replay, *, n_step: int) -> Array:
   """bool[]: a slot with ``n_step`` slots after it is held."""
   return replay.size > n_step

@@ -59,6 +59,11 @@ class RunFolder:
     """Folder of evaluation videos; made by whoever writes the first one."""
     return self.path / "videos"
 
+  @property
+  def faults(self) -> Path:
+    """Folder of updates that were not finite, see ``faults``."""
+    return self.path / "faults"
+
 
 def create(run_dir: Path, config: TrainConfig, *, overwrite: bool = False) -> RunFolder:
   """Makes the folder and writes ``config.json`` and ``versions.json`` into it.
@@ -81,8 +86,10 @@ def open_run(run_dir: Path) -> RunFolder:
   """An existing run, to resume or to evaluate.
 
   Raises:
-    ConfigError: it is not a run folder, or its configuration cannot be read.
+    ConfigError: it is not a run folder, its configuration cannot be read, or links
+      lead out of it.
   """
+  runs.check_contained(run_dir)
   return RunFolder(path=run_dir.absolute(), config=runs.load_run_config(run_dir))
 
 

@@ -18,17 +18,36 @@ from apnpql_jax.config import (
 CONFIG_FILE = "config.json"
 """Its presence makes a folder a run folder."""
 
+INTERRUPTED = 128
+"""Exit code of a run stopped by a signal, plus the number of the signal."""
+
+FAILED = 3
+"""Exit code of a run that stopped by itself: disk full, or values not finite."""
+
+_MAX_CONFIG_BYTES = 1 << 20
+
 MAY_CHANGE = (
   "total_steps",
   "eval_every",
   "eval_episodes",
   "checkpoint_every",
   "keep_checkpoints",
+  "save_replay_every",
+  "max_skipped_updates",
   "video",
   "sinks",
 )
 """Settings that a resumed run may change: none of them alters what is learned from a
 given state of the run."""
+
+
+class RunStopped(Exception):
+  """A run ended before its last step, in order; the one-line message says why."""
+
+  def __init__(self, message: str, code: int):
+    """Keeps the exit code, ``INTERRUPTED`` plus a signal or ``FAILED``."""
+    super().__init__(message)
+    self.code = code
 
 
 def new_run_dir(preset: str, root: Path = Path("runs")) -> Path:
@@ -52,11 +71,38 @@ def load_run_config(run_dir: Path) -> TrainConfig:
       f"{_nearby_runs(run_dir)}"
     )
   try:
-    return config_from_json(path.read_text(encoding="utf-8"))
+    return config_from_json(read_small(path, _MAX_CONFIG_BYTES))
   except ConfigError as error:
     raise ConfigError(f"{path}: {error}") from None
-  except (OSError, UnicodeDecodeError) as error:
+  except (OSError, ValueError) as error:
     raise ConfigError(f"{path} cannot be read: {error}") from None
+
+
+def read_small(path: Path, limit: int) -> str:
+  """The text of a file that other people may have made.
+
+  Raises:
+    ValueError: it has more than ``limit`` bytes, or is not UTF-8.
+  """
+  with path.open("rb") as file:
+    data = file.read(limit + 1)
+  if len(data) > limit:
+    raise ValueError(f"more than {limit} bytes")
+  return data.decode("utf-8")
+
+
+def check_contained(run_dir: Path) -> None:
+  """Refuses a run folder from which links lead outside.
+
+  What a run writes, and the checkpoints it deletes, would then lie elsewhere.
+
+  Raises:
+    ConfigError: names the first such link.
+  """
+  inside = run_dir.resolve()
+  for path in sorted(run_dir.rglob("*")):
+    if path.is_symlink() and not path.resolve().is_relative_to(inside):
+      raise ConfigError(f"{path} is a link that leads out of the run folder")
 
 
 def check_resumable(run_dir: Path, wanted: TrainConfig) -> None:

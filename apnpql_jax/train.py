@@ -7,31 +7,51 @@ from __future__ import annotations
 
 from collections.abc import Generator
 import contextlib
+import dataclasses
 import functools
-import math
+import logging
 from pathlib import Path
 import signal
 import sys
-import time
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
-from apnpql_jax import checkpoint, codec, memory, run_folder
+from apnpql_jax import (
+  checkpoint,
+  codec,
+  demonstrations,
+  faults,
+  leaves,
+  memory,
+  replay,
+  run_folder,
+  runs,
+)
 from apnpql_jax.agents.learner import Agent, make_agent
+from apnpql_jax.checkpoint_writer import CheckpointWriter
 from apnpql_jax.config import TrainConfig
 from apnpql_jax.env import Env, make_env
-from apnpql_jax.evaluate import make_player, play_held_out
 from apnpql_jax.extra_sinks import check_sinks, make_sinks
 from apnpql_jax.iteration import TrainState, initial_state, make_iteration
-from apnpql_jax.metrics import MetricWriter, plot_curve, read_rows
+from apnpql_jax.metrics import MetricWriter
 from apnpql_jax.progress import TrainProgress
-from apnpql_jax.recording import record_episodes
-from apnpql_jax.rollout import agent_policy
+from apnpql_jax.reporter import Reporter
 from apnpql_jax.run_folder import RunFolder
+from apnpql_jax.runs import RunStopped
 
-EVAL_SEED = 1
-"""Evaluations during training always play the same held-out episodes."""
+
+@dataclasses.dataclass(frozen=True)
+class Start:
+  """A run about to go on."""
+
+  env: Env
+  agent: Agent
+  folder: RunFolder
+  state: TrainState
+  resume_step: int | None
+  """Step it goes on from; None if it is new."""
 
 
 def train(
@@ -42,7 +62,7 @@ def train(
   Args:
     config: everything that decides the run.
     run_dir: the run folder.
-    resume: go on from the newest checkpoint of ``run_dir``.
+    resume: go on from the newest checkpoint of ``run_dir`` that is whole.
     overwrite: replace the run that ``run_dir`` holds, once the new one can start.
 
   Returns:
@@ -50,51 +70,82 @@ def train(
 
   Raises:
     ConfigError: before anything is written.
-    KeyboardInterrupt: SIGINT or SIGTERM came; the state is saved.
+    RunStopped: SIGINT or SIGTERM came, and the state is saved; or the run cannot go
+      on, and its checkpoints are as they were.
   """
-  check_sinks(config.sinks)
-  if resume:
-    checkpoint.check(run_dir, None, config=config)
-  env, agent = make_env(config.env), make_agent(config.agent)
-  build = functools.partial(initial_state, config, env, agent)
-  example = jax.eval_shape(build)
-  memory.check_memory(_nbytes(example), "the training state")
-  if resume:
-    folder = run_folder.open_run(run_dir)
-    for change in run_folder.changed_versions(folder):
-      _say(f"not as when the run began: {change}")
-    state = checkpoint.restore(run_dir, None, example, config=config)
-  else:
-    _say("collecting the expert's replay")
-    state = build()
-    folder = run_folder.create(run_dir, config, overwrite=overwrite)
-  start = int(state.env_steps) if resume else None
+  start = _start(config, run_dir, resume=resume, overwrite=overwrite)
+  folder = start.folder
   _say(f"run folder {folder.path}; compiling, which takes a minute or two")
-  with (
-    MetricWriter(
-      folder.path,
-      resume_step=start,
-      sinks=make_sinks(config.sinks, folder.path, dict(codec.flatten(config))),
-    ) as writer,
-    checkpoint.CheckpointWriter(
-      folder.path, config, keep=config.keep_checkpoints, resume_step=start
-    ) as saver,
-    TrainProgress(config.total_steps) as progress,
-    caught_signals() as caught,
-  ):
-    reporter = _Reporter(config, env, agent, folder, writer, progress)
-    state = _loop(
-      config, make_iteration(config, env, agent), state, reporter, saver, caught
-    )
+  try:
+    with (
+      MetricWriter(
+        folder.path,
+        resume_step=start.resume_step,
+        sinks=make_sinks(config.sinks, folder.path, dict(codec.flatten(config))),
+      ) as writer,
+      CheckpointWriter(
+        folder.path,
+        config,
+        keep=config.keep_checkpoints,
+        resume_step=start.resume_step,
+      ) as saver,
+      TrainProgress(config.total_steps) as progress,
+      caught_signals() as caught,
+    ):
+      reporter = Reporter(config, start.env, start.agent, folder, writer, progress)
+      iteration = make_iteration(config, start.env, start.agent)
+      state = _loop(config, iteration, start.state, reporter, saver, caught)
+      if figures := saver.finished(wait=True):
+        writer.write(int(state.env_steps), figures)
+  except OSError as error:  # The disk is full or gone.
+    raise RunStopped(f"{error}; {_how_to_go_on(run_dir)}", runs.FAILED) from error
   if caught:
-    _say(f"saved at step {int(state.env_steps):,}; to go on: --resume {run_dir}")
-    raise KeyboardInterrupt
+    raise RunStopped(
+      f"saved at step {int(state.env_steps):,}; {_how_to_go_on(run_dir)}",
+      runs.INTERRUPTED + caught[0],
+    )
   return {
     "run": str(folder.path),
     "env_steps": int(state.env_steps),
     "updates": int(state.learner.step),
     **reporter.evaluation,
   }
+
+
+def _start(
+  config: TrainConfig, run_dir: Path, *, resume: bool, overwrite: bool
+) -> Start:
+  """Builds or restores everything; makes the folder last."""
+  # What Orbax logs of a save that fails, tracebacks of each thread, is said by us.
+  logging.getLogger("absl").setLevel(logging.CRITICAL)
+  check_sinks(config.sinks)
+  saved = resume and checkpoint.latest_step(run_dir) is not None
+  if saved:
+    checkpoint.check(run_dir, None, config=config)
+  env, agent = make_env(config.env), make_agent(config.agent)
+  build = functools.partial(initial_state, config, env, agent)
+  example = jax.eval_shape(build)
+  memory.check_memory(leaves.nbytes(example), "the training state")
+  if resume:
+    folder = run_folder.open_run(run_dir)
+    for change in run_folder.changed_versions(folder):
+      _say(f"not as when the run began: {change}")
+  if saved:
+    state = _restore(config, run_dir, example)
+    return Start(env, agent, folder, state, int(state.env_steps))
+  expert_replay = None
+  if path := config.replay.demonstrations:
+    demos = demonstrations.load(Path(path), env)
+    _say(f"{demos.instants} instants of {path} for {config.replay.expert_steps} slots")
+    expert_replay = demonstrations.make_replay(demos, config, env)
+  else:
+    _say("collecting the expert's replay")
+  state = build(expert_replay)
+  if resume:
+    _say("it was stopped before its first checkpoint, and begins again")
+    return Start(env, agent, folder, state, 0)
+  folder = run_folder.create(run_dir, config, overwrite=overwrite)
+  return Start(env, agent, folder, state, None)
 
 
 def _loop(config, iteration, state, reporter, saver, caught) -> TrainState:
@@ -104,73 +155,50 @@ def _loop(config, iteration, state, reporter, saver, caught) -> TrainState:
     before = step
     state, metrics = iteration(state)
     step = int(state.env_steps)
+    reporter.iteration(step, int(state.learner.step), metrics | saver.finished())
+    faults.check(config, state, reporter.folder)
     done = step >= config.total_steps
-    reporter.iteration(step, int(state.learner.step), metrics)
     rate = None
-    if done or _passed(before, step, config.eval_every):
+    # Who sends a signal may not wait for an evaluation before the state is safe.
+    if not caught and (done or _passed(before, step, config.eval_every)):
       rate = reporter.evaluate(step, state, last=done)
-    if done or caught or _passed(before, step, config.checkpoint_every):
-      saver.save(step, state, success_rate=rate)
+    last = done or bool(caught)
+    whole = _passed(before, step, config.save_replay_every or config.checkpoint_every)
+    if last or whole or _passed(before, step, config.checkpoint_every):
+      items = _to_items(state, whole=last or whole or saver.empty)
+      saver.save(step, items, success_rate=rate)
   return state
 
 
-class _Reporter:
-  """Metrics, progress, evaluation, curve and videos of a run."""
+def _to_items(state: TrainState, *, whole: bool) -> dict[str, Any]:
+  """The parts of a checkpoint; the replay, by far the largest, only if ``whole``."""
+  rest = {name: getattr(state, name) for name in ("env", "key", "env_steps", "faults")}
+  items: dict[str, Any] = {"learner": state.learner, "rest": rest}
+  if whole:
+    items["replay"] = {"agent": state.replay, "expert": state.expert_replay}
+  return items
 
-  def __init__(
-    self,
-    config: TrainConfig,
-    env: Env,
-    agent: Agent,
-    folder: RunFolder,
-    writer: MetricWriter,
-    progress: TrainProgress,
-  ):
-    self._config, self._env, self._folder = config, env, folder
-    self._writer, self._progress = writer, progress
-    self._policy = lambda params: agent_policy(agent, params, greedy=False)
-    self._play = make_player(env, self._policy)
-    self._lap = time.monotonic()
-    self._row: dict[str, Any] = {}
-    self.evaluation: dict[str, Any] = {}
 
-  def iteration(self, step: int, updates: int, metrics: dict[str, Any]) -> None:
-    """Writes the row of one iteration; blocks until it has been computed."""
-    metrics = jax.device_get(metrics)
-    now = time.monotonic()
-    seconds, self._lap = now - self._lap, now
-    config = self._config
-    steps = config.rollout_length * config.env.worlds
-    metrics["time/sps_e2e"] = steps / seconds
-    metrics["time/updates_per_s"] = config.updates_per_iteration / seconds
-    self._writer.write(step, metrics)
-    self._progress.update(step, updates=updates)
-
-  def evaluate(self, step: int, state: TrainState, *, last: bool) -> float:
-    """Plays held-out episodes, writes their row, the curve and, at last, a video."""
-    began = time.monotonic()
-    config, folder = self._config, self._folder
-    params = state.learner.params
-    figures = play_held_out(
-      self._env, self._play, params, episodes=config.eval_episodes, seed=EVAL_SEED
-    )
-    self.evaluation = figures
-    row = {f"eval/{name}": value for name, value in figures.items() if name != "ci95"}
-    row["eval/ci95_low"], row["eval/ci95_high"] = figures["ci95"]
-    self._writer.write(step, row | {"eval/wall_s": time.monotonic() - began})
-    plot_curve(read_rows(folder.metrics_jsonl), folder.curve, title=config.env.task)
-    if config.video and last:
-      record_episodes(
-        self._env, self._policy(params), folder.videos / f"step_{step:08d}.mp4"
-      )
-    rate = figures["success_rate"]
-    self._progress.message(
-      f"step {step:,}: {figures['successes']} of {figures['episodes']} held-out "
-      f"episodes solved ({100 * rate:.0f} %)"
-    )
-    self._progress.update(step, updates=int(state.learner.step), success_rate=rate)
-    self._lap = time.monotonic()
-    return rate
+def _restore(config: TrainConfig, run_dir: Path, example: TrainState) -> TrainState:
+  """The newest state that can be read; undoes ``_to_items``."""
+  found = checkpoint.restore(
+    run_dir, None, _to_items(example, whole=True), config=config
+  )
+  for line in found.damaged:
+    _say(line)
+  if found.damaged:
+    _say(f"going on from the checkpoint before, {found.step}")
+  ring = found.items["replay"]["agent"]
+  if found.steps["replay"] < found.step:
+    _say(f"its replay is that of step {found.steps['replay']:,}")
+    # What comes next does not follow on its newest slots.
+    ring = replay.exclude(ring, jnp.ones(config.env.worlds, jnp.int32))
+  return TrainState(
+    learner=found.items["learner"],
+    replay=ring,
+    expert_replay=found.items["replay"]["expert"],
+    **found.items["rest"],
+  )
 
 
 @contextlib.contextmanager
@@ -196,13 +224,13 @@ def caught_signals() -> Generator[list[int]]:
       signal.signal(each, old)
 
 
+def _how_to_go_on(run_dir: Path) -> str:
+  return f"to go on: --resume {run_dir}"
+
+
 def _say(text: str) -> None:
   print(text, file=sys.stderr, flush=True)
 
 
 def _passed(before: int, now: int, every: int) -> bool:
   return now // every > before // every
-
-
-def _nbytes(tree: Any) -> int:
-  return sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(tree))

@@ -37,12 +37,17 @@ _POSITIVE = (
   "agent.ap_delta agent.min_std agent.policy_min_std "
   "agent.initial_alpha agent.min_alpha "
   "replay.capacity replay.batch_size total_steps rollout_length "
-  "updates_per_iteration eval_every eval_episodes checkpoint_every keep_checkpoints"
+  "updates_per_iteration eval_every eval_episodes checkpoint_every keep_checkpoints "
+  "max_skipped_updates"
 ).split()
 _NOT_NEGATIVE = (
   "agent.learning_rate_m agent.learning_rate_alpha agent.learning_rate_nu "
-  "agent.lambda_ap agent.m_step_delay replay.expert_steps replay.expert_noise seed"
+  "agent.lambda_ap agent.m_step_delay replay.expert_steps replay.expert_noise seed "
+  "save_replay_every"
 ).split()
+
+_AT_MOST = {"env.bank_rows": 1 << 20, "agent.num_atoms": 10_000}
+"""What is computed on the host before memory can be checked."""
 
 
 def validate(
@@ -102,6 +107,9 @@ def _validate_ranges(config: TrainConfig) -> None:
   for name in _NOT_NEGATIVE:
     if values[name] < 0:
       raise ConfigError(f"{name}={values[name]} must not be negative")
+  for name, most in _AT_MOST.items():
+    if values[name] > most:
+      raise ConfigError(f"{name}={values[name]} must be at most {most}")
   if config.env.bank_rows < MIN_BANK_ROWS:
     raise ConfigError(
       f"env.bank_rows={config.env.bank_rows} must be at least {MIN_BANK_ROWS}: a "
@@ -186,6 +194,11 @@ def _validate_replay(config: TrainConfig, memory_bytes: int | None) -> None:
   if expert and not replay.expert_steps:
     raise ConfigError(
       "replay.expert_steps=0 leaves nothing to draw; use replay.expert_share=0"
+    )
+  if replay.demonstrations and not replay.expert_steps:
+    raise ConfigError(
+      "replay.expert_steps=0 leaves no room for replay.demonstrations="
+      f"{replay.demonstrations}"
     )
   if replay.capacity % per_iteration:
     raise ConfigError(

@@ -113,6 +113,32 @@ def test_a_resumed_run_appends_and_its_clock_goes_on(tmp_path: Path):
   assert [row["a"] for row in _csv(tmp_path)] == ["10.0", "20.0", ""]
 
 
+def test_large_files_are_put_aside_and_taken_back(tmp_path: Path):
+  with metrics.MetricWriter(tmp_path, max_bytes=300) as writer:
+    for step in range(1, 31):
+      writer.write(step, {metrics.SUCCESS: step / 30, "loss": 0.5})
+  files = metrics.metric_files(tmp_path)
+  names = [f"metrics.{n}.jsonl" for n in range(1, len(files))] + ["metrics.jsonl"]
+  assert [path.name for path in files] == names and len(files) > 3
+  assert all(path.stat().st_size < 400 for path in files)
+  steps = [row["step"] for path in files for row in metrics.read_rows(path)]
+  assert steps == list(range(1, 31))
+  assert [row["step"] for row in metrics.read_evaluations(tmp_path)] == steps
+  # Each has its table beside it.
+  assert {path.with_suffix(".csv").exists() for path in files} == {True}
+  assert [row["step"] for row in _csv(tmp_path)] == [
+    str(row["step"]) for row in metrics.read_rows(files[-1])
+  ]
+  # A run that goes on from the second file has forgotten those after it.
+  resume = metrics.read_rows(files[1])[0]["step"]
+  with metrics.MetricWriter(tmp_path, resume_step=int(resume or 0)) as writer:
+    writer.write(99, {"loss": 1.0})
+  left = {path.name for path in tmp_path.iterdir()}
+  assert left == {"metrics.jsonl", "metrics.csv", "metrics.1.jsonl", "metrics.1.csv"}
+  rows = metrics.read_rows(tmp_path / "metrics.jsonl")
+  assert [row["step"] for row in rows] == [resume, 99]
+
+
 def test_a_damaged_record_is_refused(tmp_path: Path):
   path = tmp_path / "metrics.jsonl"
   for text in ("oops\n", '{"a": 1}\n', "[1]\n", '{"step": "x"}\n'):

@@ -1,0 +1,58 @@
+"""Reads ``.npz`` files that other people made: arrays only, sizes before memory."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+import zipfile
+import zlib
+
+import numpy as np
+
+from apnpql_jax.config import ConfigError
+
+_ERRORS = (OSError, ValueError, EOFError, KeyError, RuntimeError, MemoryError)
+_ERRORS += (NotImplementedError, zipfile.BadZipFile, zlib.error)
+"""What zipfile and NumPy raise at archives that are none."""
+
+
+def read(path: Path, *, limit: int) -> dict[str, np.ndarray]:
+  """All arrays of an archive; nothing in it is executed.
+
+  Args:
+    path: the file.
+    limit: bytes that all arrays together may take.
+
+  Raises:
+    ConfigError: it is no archive of arrays, is damaged, holds Python objects, or takes
+      more than ``limit``.
+  """
+  try:
+    with zipfile.ZipFile(path) as archive:
+      names = archive.namelist()
+      size = sum(_nbytes(archive, name) for name in names)
+      if size > limit:
+        raise ConfigError(f"{path} takes {size} bytes, more than {limit}")
+      return {name.removesuffix(".npy"): _array(archive, name) for name in names}
+  except ConfigError:
+    raise
+  except _ERRORS as error:
+    text = " ".join(str(error).split())[:200] or type(error).__name__
+    raise ConfigError(f"{path} is no archive of arrays: {text}") from None
+
+
+def _nbytes(archive: zipfile.ZipFile, name: str) -> int:
+  """What the header of an array asks for."""
+  with archive.open(name) as file:
+    version = np.lib.format.read_magic(file)
+    if version != (1, 0):
+      raise ValueError(f"{name}: unknown version {version}")
+    shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+  if dtype.hasobject or any(n < 0 for n in shape):
+    raise ValueError(f"{name}: {dtype}{list(shape)} is no plain array")
+  return math.prod(shape) * dtype.itemsize
+
+
+def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+  with archive.open(name) as file:
+    return np.lib.format.read_array(file, allow_pickle=False)

@@ -1,0 +1,81 @@
+"""What a run tells while it trains: metrics, progress, evaluations, curve and video."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import jax
+
+from apnpql_jax.agents.learner import Agent
+from apnpql_jax.config import TrainConfig
+from apnpql_jax.env import Env
+from apnpql_jax.evaluate import make_player, play_held_out
+from apnpql_jax.iteration import TrainState
+from apnpql_jax.metrics import MetricWriter, plot_curve, read_evaluations
+from apnpql_jax.progress import TrainProgress
+from apnpql_jax.recording import record_episodes
+from apnpql_jax.rollout import agent_policy
+from apnpql_jax.run_folder import RunFolder
+
+EVAL_SEED = 1
+"""Evaluations during training always play the same held-out episodes."""
+
+
+class Reporter:
+  """Metrics, progress, evaluation, curve and videos of a run."""
+
+  def __init__(
+    self,
+    config: TrainConfig,
+    env: Env,
+    agent: Agent,
+    folder: RunFolder,
+    writer: MetricWriter,
+    progress: TrainProgress,
+  ):
+    """Builds the player of evaluations; nothing is compiled yet."""
+    self._config, self._env, self.folder = config, env, folder
+    self._writer, self._progress = writer, progress
+    self._policy = lambda params: agent_policy(agent, params, greedy=False)
+    self._play = make_player(env, self._policy)
+    self._lap = time.monotonic()
+    self.evaluation: dict[str, Any] = {}
+
+  def iteration(self, step: int, updates: int, metrics: dict[str, Any]) -> None:
+    """Writes the row of one iteration; blocks until it has been computed."""
+    metrics = jax.device_get(metrics)
+    now = time.monotonic()
+    seconds, self._lap = now - self._lap, now
+    config = self._config
+    steps = config.rollout_length * config.env.worlds
+    metrics["time/sps_e2e"] = steps / seconds
+    metrics["time/updates_per_s"] = config.updates_per_iteration / seconds
+    self._writer.write(step, metrics)
+    self._progress.update(step, updates=updates)
+
+  def evaluate(self, step: int, state: TrainState, *, last: bool) -> float:
+    """Plays held-out episodes, writes their row, the curve and, at last, a video."""
+    began = time.monotonic()
+    config, folder = self._config, self.folder
+    params = state.learner.params
+    figures = play_held_out(
+      self._env, self._play, params, episodes=config.eval_episodes, seed=EVAL_SEED
+    )
+    self.evaluation = figures
+    row = {f"eval/{name}": value for name, value in figures.items() if name != "ci95"}
+    row["eval/ci95_low"], row["eval/ci95_high"] = figures["ci95"]
+    self._writer.write(step, row | {"eval/wall_s": time.monotonic() - began})
+    plot_curve(read_evaluations(folder.path), folder.curve, title=config.env.task)
+    if config.video and last:
+      record_episodes(
+        self._env, self._policy(params), folder.videos / f"step_{step:08d}.mp4"
+      )
+    rate = figures["success_rate"]
+    self._progress.message(
+      f"step {step:,}: {figures['successes']} of {figures['episodes']} held-out "
+      f"episodes solved ({100 * rate:.0f} %)"
+    )
+    self._progress.update(step, updates=int(state.learner.step), success_rate=rate)
+    self._lap = time.monotonic()
+    return rate

@@ -1,0 +1,213 @@
+"""Demonstration files and recordings: what is made of them is what was seen."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from hypothesis import HealthCheck, given, settings, strategies as st
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+import tiny
+
+from apnpql_jax import demonstrations, recordings
+from apnpql_jax.config import ConfigError
+from apnpql_jax.demonstrations import Demonstrations
+from apnpql_jax.env import Env, make_env
+
+ENV = dataclasses.replace(tiny.CONFIG.env, time_limit_s=0.9)
+CONFIG = dataclasses.replace(tiny.CONFIG, env=ENV)
+EPISODES, STEPS = 6, 6
+
+
+@pytest.fixture(scope="module")
+def env() -> Env:
+  return make_env(ENV)
+
+
+@pytest.fixture(scope="module")
+def demos(env) -> Demonstrations:
+  return demonstrations.record_expert(env, episodes=EPISODES, seed=0, noise=0.1)
+
+
+@pytest.fixture
+def path(tmp_path, demos) -> Path:
+  path = tmp_path / "demos.npz"
+  demonstrations.save(path, demos, task="push_plate", control_period_s=0.15)
+  return path
+
+
+def test_a_file_holds_what_was_recorded(path, demos, env):
+  loaded = demonstrations.load(path, env)
+  assert demos.instants == EPISODES * (STEPS + 1)
+  assert demos.first.sum() == EPISODES
+  for a, b in zip(loaded, demos, strict=True):
+    np.testing.assert_array_equal(a, b)
+
+
+def test_the_replay_is_what_the_worlds_showed(demos, env):
+  """Compared with the worlds themselves, taken through the recorded actions."""
+  ring = demonstrations.make_replay(demos, CONFIG, env)
+  slots = jax.tree.map(np.asarray, ring.slots)
+  length, worlds = slots.action.shape[:2]
+  assert (length, worlds) == (8, 4) and int(ring.size) == 8
+  begin = np.flatnonzero(demos.first)
+  rows = jax.random.split(jax.random.key(0))[0]
+  rows = jax.random.randint(rows, (EPISODES,), 0, env.bank_split)
+  state, step = jax.jit(env.reset)(rows), jax.jit(env.step)
+  index = np.resize(np.arange(demos.instants), (worlds, length)).T
+  for t in range(STEPS + 1):
+    seen = jax.tree.map(np.asarray, state.timestep)
+    for episode, start in enumerate(begin):
+      for at in zip(*np.nonzero(index == start + t), strict=True):
+        held = jax.tree.map(lambda x, at=at: x[at], slots.timestep)
+        np.testing.assert_allclose(
+          held.observation.tool, seen.observation.tool[episode], atol=1e-5
+        )
+        np.testing.assert_allclose(
+          held.observation.objects, seen.observation.objects[episode], atol=1e-5
+        )
+        assert held.reward == seen.reward[episode]
+        assert held.terminated == seen.terminated[episode]
+        assert held.truncated == (t == STEPS)
+        if at[0] >= t:  # Its column holds the episode from its first instant on.
+          np.testing.assert_allclose(
+            held.observation.robot, seen.observation.robot[episode], atol=1e-6
+          )
+          np.testing.assert_allclose(
+            held.primitives, seen.primitives[episode], atol=2e-3
+          )
+        np.testing.assert_array_equal(slots.action[at], demos.action[start + t])
+    if t < STEPS:
+      action = jnp.asarray(demos.action[begin + t])
+      state = step(state, action, jax.random.key(t))
+
+
+WRONG = {
+  "action": (lambda x: x + 1.5, "action is not within"),
+  "qpos": (lambda x: x * np.nan, "qpos is not finite at instant 0"),
+  "qvel": (lambda x: x[:, :-1], r"qvel is float32\[42, 15\], not \[42, 16\]"),
+  "mocap_quat": (lambda x: x * 2, "quaternion is not of unit length"),
+  "variant": (lambda x: x + 1, "variant is none of the scene's"),
+  "first": (lambda x: ~x, "first instant must begin"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_the_scene_cannot_be_in_is_refused(path, demos, env, name):
+  change, message = WRONG[name]
+  wrong = demos._replace(**{name: change(getattr(demos, name))})
+  demonstrations.save(path, wrong, task="push_plate", control_period_s=0.15)
+  with pytest.raises(ConfigError, match=message):
+    demonstrations.load(path, env)
+
+
+def test_other_files_are_refused_by_name(path, demos, env):
+  demonstrations.save(path, demos, task="stack_box", control_period_s=0.15)
+  with pytest.raises(ConfigError, match="has task stack_box, not push_plate"):
+    demonstrations.load(path, env)
+  demonstrations.save(path, demos, task="push_plate", control_period_s=0.1)
+  with pytest.raises(ConfigError, match=r"control_period_s 0\.1, not 0\.15"):
+    demonstrations.load(path, env)
+  np.savez(path, format=demonstrations.FORMAT, version=2)
+  with pytest.raises(ConfigError, match="lacks or has in excess: action"):
+    demonstrations.load(path, env)
+  with pytest.raises(ConfigError, match="no archive"):
+    demonstrations.load(path.with_name("none"), env)
+
+
+@settings(
+  max_examples=150,
+  deadline=None,
+  suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(
+  st.sampled_from(sorted({*Demonstrations._fields, "format", "version", "task"})),
+  st.one_of(
+    st.integers(-(2**62), 2**62), st.floats(), st.text(max_size=5), st.booleans()
+  ),
+  st.lists(st.integers(0, 5), max_size=3),
+)
+def test_no_array_in_place_of_another_gets_through(path, env, name, value, shape):
+  arrays: dict[str, Any] = dict(np.load(path, allow_pickle=False))
+  changed: dict[str, Any] = arrays | {name: np.full(shape, value)}
+  np.savez(path, **changed)
+  try:
+    demonstrations.load(path, env)
+  except ConfigError as error:
+    assert "\n" not in str(error)
+  else:
+    assert np.array_equal(np.full(shape, value).astype(str), arrays[name].astype(str))
+  finally:
+    np.savez(path, **arrays)
+
+
+def _recording(env: Env, demos: Demonstrations) -> dict[str, Any]:
+  """The episodes as somebody would have measured them, three times as often."""
+  free, _ = env.task.scene.free_joint("plate")
+  finger = env.task.scene.gripper_qpos
+  times, parts, period = [], [], 0.15
+  for start in np.flatnonzero(demos.first):
+    coarse = period * np.arange(STEPS + 1)
+    fine = np.linspace(0, coarse[-1], 3 * STEPS + 1)
+    rows = slice(start, start + STEPS + 1)
+    plate = demos.qpos[rows, free : free + 7]
+    turned = Slerp(coarse, Rotation.from_quat(plate[:, 3:], scalar_first=True))(fine)
+    quat = turned.as_quat(scalar_first=True)
+    quat[1::2] *= -1  # As trackers do.
+    line = lambda x, c=coarse, f=fine: np.stack([np.interp(f, c, y) for y in x.T], 1)  # noqa: E731
+    goal = np.concatenate([demos.mocap_pos[start, 0], demos.mocap_quat[start, 0]])
+    times.append(fine + 100 * start)
+    parts.append(
+      {
+        "joints": line(demos.qpos[rows, env.task.scene.arm_qpos]),
+        "gripper": line(demos.qpos[rows, finger : finger + 1] / 1.1)[:, 0],
+        "plate": np.concatenate([line(plate[:, :3]), quat], 1),
+        "goal": np.tile(goal, (len(fine), 1)),
+        "episode": np.full(len(fine), start),
+      }
+    )
+  joined = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
+  return joined | {"time": np.concatenate(times)}
+
+
+def test_a_recording_becomes_the_demonstrations_it_was_made_of(tmp_path, demos, env):
+  path = tmp_path / "recording.npz"
+  np.savez(path, **_recording(env, demos))
+  made = recordings.convert(path, env.task.scene, period_s=0.15)
+  np.testing.assert_array_equal(made.first, demos.first)
+  robot = env.task.scene.arm_qpos
+  np.testing.assert_allclose(made.qpos[:, robot], demos.qpos[:, robot], atol=1e-5)
+  np.testing.assert_allclose(made.qpos[:, 10:13], demos.qpos[:, 10:13], atol=1e-5)
+  inner = abs((made.qpos[:, 13:] * demos.qpos[:, 13:]).sum(1))
+  np.testing.assert_allclose(inner, 1.0, atol=1e-5)
+  np.testing.assert_allclose(made.mocap_pos, demos.mocap_pos, atol=1e-6)
+  # The velocity that leads from one instant to the next, by the joints themselves.
+  inside = np.flatnonzero(~demos.first) - 1
+  moved = (demos.qpos[inside + 1][:, robot] - demos.qpos[inside][:, robot]) / 0.15
+  np.testing.assert_allclose(made.action[inside, :6], moved.clip(-1, 1), atol=1e-4)
+  np.testing.assert_allclose(made.qvel[inside, :6], moved, atol=1e-4)
+
+
+def test_what_a_recording_cannot_tell_is_asked_for(tmp_path, demos, env):
+  whole, path = _recording(env, demos), tmp_path / "recording.npz"
+
+  def refused(match: str, **changes: np.ndarray | None) -> None:
+    changed: dict[str, Any] = {
+      k: v for k, v in (whole | changes).items() if v is not None
+    }
+    np.savez(path, **changed)
+    with pytest.raises(ConfigError, match=match):
+      recordings.convert(path, env.task.scene, period_s=0.15)
+
+  refused("lacks the poses of goal, plate: rewards, labels", plate=None, goal=None)
+  refused("time must increase", time=-whole["time"])
+  refused("joints must be numbers of shape", joints=whole["joints"][:, :5])
+  refused("moves at .* rad/s", joints=5 * whole["joints"])
+  refused("unknown arrays .'camera'", camera=np.zeros(3))
+  refused("gripper is not finite", gripper=whole["gripper"] * np.nan)
+  refused("time must be numbers", time=None)

@@ -1,0 +1,79 @@
+"""A run that is killed, stopped and resumed is the run it would have been.
+
+Real processes on the native engine, which are expensive to start: each proves several
+promises. What they found is in ``docs/reliability.md``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+import signal
+import subprocess
+import time
+
+import numpy as np
+import pytest
+import tiny
+
+from apnpql_jax import checkpoint
+
+PATIENCE_S = 900
+
+
+def _wait_for_progress(process: subprocess.Popen[bytes], said: Path) -> None:
+  """Until a run just started has done an iteration, and says so."""
+  before, deadline = said.read_text().count("%)"), time.monotonic() + PATIENCE_S
+  while said.read_text().count("%)") == before:
+    assert process.poll() is None and time.monotonic() < deadline
+    time.sleep(0.02)
+
+
+def _finish(process: subprocess.Popen[bytes], said: Path) -> None:
+  assert process.wait(PATIENCE_S) == 0, said.read_text()[-2000:]
+
+
+@pytest.mark.parametrize(
+  "kills", [2, pytest.param(20, marks=pytest.mark.slow, id="20")]
+)
+def test_a_run_killed_at_random_moments_ends_as_if_nothing_had_been(tmp_path, kills):
+  rng, said, run = np.random.default_rng(kills), tmp_path / "said", tmp_path / "run"
+  lost, saving = [], 0
+  for _ in range(kills):
+    process = tiny.start(run, "--total-steps", "100000", said=said)
+    _wait_for_progress(process, said)
+    time.sleep(rng.uniform(0.0, 5.0))
+    process.kill()
+    process.wait()
+    reached = tiny.rows(run)[-1]["step"]
+    lost.append(reached - (checkpoint.latest_step(run) or 0))
+    saving += any((run / "checkpoints").glob("*tmp*"))
+    print(f"lost {lost[-1]} of {reached}", flush=True)
+  # An interval, and what is trained while a checkpoint is being written.
+  assert max(lost) <= 2 * tiny.CONFIG.checkpoint_every
+  print(f"{kills} kills, {saving} while saving; environment steps lost: {lost}")
+
+  process = tiny.start(run, "--total-steps", "100000", said=said)
+  _wait_for_progress(process, said)
+  process.terminate()
+  assert process.wait(PATIENCE_S) == 128 + signal.SIGTERM
+  stopped = checkpoint.latest_step(run)
+  assert f"saved at step {stopped:,}; to go on: --resume {run}" in said.read_text()
+
+  # Evaluations are none of the training's business.
+  total = str(tiny.rows(run)[-1]["step"] + 4 * tiny.STEPS)
+  other = ["--eval-episodes", "2", "--checkpoint-every", "1000000"]
+  straight = tmp_path / "straight"
+  together = [
+    tiny.start(run, "--total-steps", total, said=said),
+    tiny.start(straight, "--total-steps", total, *other, said=tmp_path / "said2"),
+  ]
+  for process in together:
+    _finish(process, said)
+  bits = tiny.saved_bytes(run, int(total))
+  assert bits == tiny.saved_bytes(straight, int(total)) and len(bits) > 50
+  # Each iteration stands once in the metrics, with the same figures.
+  losses = [
+    [(row["step"], row["loss/q"]) for row in tiny.rows(folder) if "loss/q" in row]
+    for folder in (run, straight)
+  ]
+  assert losses[0] == losses[1] and len(losses[0]) == int(total) // tiny.STEPS

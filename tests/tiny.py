@@ -1,0 +1,92 @@
+"""The smallest runs that are still real, shared by the tests of reliability.
+
+Their processes compile without optimisation: the native engine's callbacks keep XLA
+from caching what it compiled, and nobody waits for such a run to be fast.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+from typing import Any
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+
+from apnpql_jax.config import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
+
+ROOT = Path(__file__).resolve().parents[1]
+
+FAST_COMPILE = {
+  "xla_backend_optimization_level": 0,
+  "xla_llvm_disable_expensive_passes": True,
+}
+
+CONFIG = TrainConfig(
+  env=EnvConfig(worlds=4, bank_rows=256, obs="state", backend="native"),
+  agent=AgentConfig(
+    n_step=2,
+    hidden=(16, 16),
+    feature_dim=16,
+    target_samples=4,
+    policy_samples=4,
+    # Room for each algorithm: all must take steps from the first update on.
+    m_step_delay=0,
+  ),
+  replay=ReplayConfig(capacity=64, expert_steps=32, expert_share=0.5, batch_size=8),
+  total_steps=64,
+  rollout_length=2,
+  updates_per_iteration=2,
+  eval_every=1_000_000,
+  eval_episodes=4,
+  checkpoint_every=16,
+  video=False,
+)
+STEPS = CONFIG.env.worlds * CONFIG.rollout_length
+"""Environment steps per iteration."""
+
+_PRESET_ARGS = (
+  "--env.worlds 4 --env.bank-rows 256 --obs state --backend native --agent.n-step 2 "
+  "--agent.hidden 16 16 --agent.feature-dim 16 --agent.target-samples 4 "
+  "--agent.policy-samples 4 --agent.m-step-delay 0 --replay.capacity 64 "
+  "--replay.expert-steps 32 --replay.expert-share 0.5 --replay.batch-size 8 "
+  "--rollout-length 2 --updates-per-iteration 2 --eval-every 1000000 "
+  "--eval-episodes 4 --checkpoint-every 16 --no-video"
+).split()
+
+
+def start(run_dir: Path, *args: str, said: Path) -> subprocess.Popen[bytes]:
+  """Trains in a new process, or goes on if ``run_dir`` is a run; stderr to ``said``."""
+  command = [sys.executable, "-m", "apnpql_jax", "train"]
+  if (run_dir / "config.json").exists():
+    command += ["--resume", str(run_dir)]
+  else:
+    command += ["push_plate", "--run", str(run_dir), *_PRESET_ARGS]
+  flags = " ".join(f"--{name}={value}" for name, value in FAST_COMPILE.items())
+  env = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": str(ROOT)}
+  with said.open("ab") as file:
+    return subprocess.Popen(
+      [*command, *args], cwd=said.parent, env=env, stdout=file, stderr=file
+    )
+
+
+def rows(run_dir: Path) -> list[dict[str, Any]]:
+  """Whole rows of the metrics of a run; none if it has not begun."""
+  path = run_dir / "metrics.jsonl"
+  lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+  return [json.loads(line) for line in lines if line.endswith("\n")]
+
+
+def saved_bytes(run_dir: Path, step: int) -> dict[str, bytes]:
+  """Every array of a checkpoint, read by Orbax alone."""
+  found = {}
+  for item in ("learner", "rest", "replay"):
+    with ocp.StandardCheckpointer() as reader:
+      tree = reader.restore((run_dir / "checkpoints" / str(step) / item).absolute())
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+      found[f"{item} {path}"] = np.asarray(leaf).tobytes()
+  return found
