@@ -101,7 +101,7 @@ def _example_batch(arrays: dict[str, np.ndarray]) -> Transition:
     held = {f: 0 if f"batch/{name}/{f}" in arrays else None for f in fields}
     return Observation(**held)
 
-  def filled(kind: type, **given: Any) -> Any:
+  def filled(kind: Any, **given: Any) -> Any:
     return kind(**dict.fromkeys(kind.__dataclass_fields__, 0) | given)
 
   window = None

@@ -49,7 +49,7 @@ def key_impls(tree: Any) -> dict[str, str]:
 def checksums(tree: Any) -> dict[str, int]:
   """Path of each leaf -> CRC-32 of its bytes, typed keys by their data."""
   return {
-    path: zlib.crc32(np.ascontiguousarray(_key_data(leaf)).reshape(-1).view(np.uint8))
+    path: zlib.crc32(np.asarray(_key_data(leaf)).tobytes())
     for path, leaf in named(tree).items()
   }
 
