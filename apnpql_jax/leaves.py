@@ -49,9 +49,12 @@ def key_impls(tree: Any) -> dict[str, str]:
 def checksums(tree: Any) -> dict[str, int]:
   """Path of each leaf -> CRC-32 of its bytes, typed keys by their data."""
   return {
-    path: zlib.crc32(np.asarray(_key_data(leaf)).tobytes())
-    for path, leaf in named(tree).items()
+    path: zlib.crc32(_bytes(_key_data(leaf)).data) for path, leaf in named(tree).items()
   }
+
+
+def _bytes(array: Any) -> np.ndarray:
+  return np.ascontiguousarray(array).reshape(-1).view(np.uint8)
 
 
 def to_plain(tree: Any) -> Any:

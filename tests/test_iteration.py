@@ -184,7 +184,7 @@ def test_a_broken_world_starts_again_and_its_episode_is_never_drawn(
     after.env.physics.qpos[others], clean.env.physics.qpos[others]
   )
   keys = jax.random.split(jax.random.key(0), 64)
-  sample = jax.jit(make_sample(built.config, built.agent))
+  sample = jax.jit(make_sample(built.config, make_agent(built.config.agent)))
   for key in keys:
     batch = sample(after.replay, after.expert_replay, key)
     drawn = jax.tree.leaves((batch.observation_tm1, batch.observation_t))
