@@ -141,4 +141,6 @@ def test_no_batch_makes_a_number_that_is_none(name: str):
   assert action.shape == (BATCH, 7) and np.all(np.abs(action) <= 1.0)
   assert set(np.unique(action[:, 6])) <= {0.0, 1.0}
   common = {"q/min", "q/max", "npql/kl_over_eps", "npql/ess", "npql/alpha_mean"}
-  assert common | {"prior/entropy", "prior/nu", "grad_norm/z"} <= set(metrics)
+  common |= {"prior/entropy", "policy/entropy", "prior/nu", "q/data", "q/target"}
+  common |= {f"grad_norm/{group}" for group in state.params}
+  assert common <= set(metrics)

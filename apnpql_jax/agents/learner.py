@@ -224,6 +224,7 @@ def total_loss(
     "npql/alpha_mean": heads.alpha(),
     "npql/max_weight": jnp.max(weights, axis=0),
     "prior/entropy": prior.entropy_bound(),
+    "policy/entropy": improved.entropy,
     "q/mean": jnp.mean(q_values, axis=0),
     "q/data": evaluation.value(outputs),
     "q/target": evaluation.expected(target),
