@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from apnpql_jax import validation
+from apnpql_jax.agents import algorithms
 from apnpql_jax.agents.algorithms import ALGORITHMS, algorithm_of
 from apnpql_jax.agents.learner import bellman_target, make_agent, total_loss
 from apnpql_jax.config import AgentConfig
@@ -87,6 +89,10 @@ def test_each_loss_trains_exactly_the_parameters_the_paper_names(name: str):
   expected = sum(metrics[k] for k in slopes) + 9.0 * metrics["loss/ap"]
   assert total == pytest.approx(float(expected), rel=1e-5)
   assert all(np.isfinite(v) for v in metrics.values())
+
+
+def test_settings_name_every_evaluation():
+  assert {"row", *algorithms.EVALUATIONS} == set(validation.EVALUATIONS)
 
 
 @pytest.mark.parametrize(

@@ -12,11 +12,7 @@ import jax.numpy as jnp
 import optax
 
 from apnpql_jax.agents import objectives
-from apnpql_jax.agents.algorithms import (
-  Algorithm,
-  algorithm_of,
-  epsilon_is_bounded,
-)
+from apnpql_jax.agents.algorithms import Algorithm, algorithm_of, epsilon_is_bounded
 from apnpql_jax.agents.networks import Heads, Networks, Params, make_networks
 from apnpql_jax.agents.policies import Candidates
 from apnpql_jax.config import AgentConfig, TrainConfig, validate
