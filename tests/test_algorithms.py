@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from apnpql_jax import validation
+from apnpql_jax.agents import algorithms
 from apnpql_jax.agents.algorithms import ALGORITHMS, algorithm_of
 from apnpql_jax.agents.learner import bellman_target, make_agent, total_loss
 from apnpql_jax.config import AgentConfig
@@ -89,6 +91,10 @@ def test_each_loss_trains_exactly_the_parameters_the_paper_names(name: str):
   assert all(np.isfinite(v) for v in metrics.values())
 
 
+def test_settings_name_every_evaluation():
+  assert {"row", *algorithms.EVALUATIONS} == set(validation.EVALUATIONS)
+
+
 @pytest.mark.parametrize(
   ("changes", "missing"),
   [
@@ -141,4 +147,6 @@ def test_no_batch_makes_a_number_that_is_none(name: str):
   assert action.shape == (BATCH, 7) and np.all(np.abs(action) <= 1.0)
   assert set(np.unique(action[:, 6])) <= {0.0, 1.0}
   common = {"q/min", "q/max", "npql/kl_over_eps", "npql/ess", "npql/alpha_mean"}
-  assert common | {"prior/entropy", "prior/nu", "grad_norm/z"} <= set(metrics)
+  common |= {"prior/entropy", "policy/entropy", "prior/nu", "q/data", "q/target"}
+  common |= {f"grad_norm/{group}" for group in state.params}
+  assert common <= set(metrics)

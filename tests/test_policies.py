@@ -47,6 +47,8 @@ def test_density_of_q_is_the_prior_times_the_importance_weights(heads):
   ratio = q.log_prob(q.samples, q.q_values) - prior.log_prob(q.samples)
   np.testing.assert_allclose(jnp.exp(ratio), 50.0 * q.weights, rtol=1e-4)
   np.testing.assert_allclose(q.weights.sum(0), 1.0, rtol=1e-5)
+  surprise = -jnp.log(50.0 * q.weights) - prior.log_prob(q.samples)
+  np.testing.assert_allclose(q.entropy, jnp.sum(q.weights * surprise, 0), rtol=1e-4)
 
 
 def test_parametric_policy_sums_over_the_gripper(heads):

@@ -45,6 +45,7 @@ class World(struct.PyTreeNode):
   holding: Array  # bool[W]
   success: Array  # bool[W]
   time: Array  # i32[W]
+  held: bool = struct.field(pytree_node=False, default=False)  # Begins in the hand.
 
   @property
   def point(self) -> Array:
@@ -78,16 +79,17 @@ Policy = Callable[[World, Array], tuple[Array, Array]]
 """(worlds, key) -> actions f32[W, 7], their log densities f32[W]."""
 
 
-def reset(key: Array) -> World:
+def reset(key: Array, *, held: bool = False) -> World:
   key_point, key_places = jax.random.split(key)
   start = jax.random.uniform(key_point, (WORLDS, 1, 6), minval=-0.5, maxval=0.5)
   places = jax.random.uniform(key_places, (WORLDS, 3, 6), minval=-1.0)
   return World(
     history=jnp.pad(jnp.repeat(start, 3, axis=1), ((0, 0), (0, 0), (0, 1))),
     places=places.at[:, 2].set(0.0),
-    holding=jnp.zeros(WORLDS, bool),
+    holding=jnp.full(WORLDS, held),
     success=jnp.zeros(WORLDS, bool),
     time=jnp.zeros(WORLDS, jnp.int32),
+    held=held,
   )
 
 
@@ -104,7 +106,7 @@ def step(world: World, action: Array, key: Array) -> World:
   last = world.timestep.last
   return jax.tree.map(
     lambda new, old: jnp.where(last.reshape((-1,) + (1,) * (new.ndim - 1)), new, old),
-    reset(key),
+    reset(key, held=world.held),
     moved,
   )
 
@@ -140,17 +142,17 @@ def rollout(
   return jax.lax.scan(body, world, jax.random.split(key, length))
 
 
-def success_rate(policy: Policy, key: Array) -> Array:
+def success_rate(policy: Policy, key: Array, *, held: bool = False) -> Array:
   """Share of the worlds solved in their first episode."""
   key_reset, key_play = jax.random.split(key)
-  _, slots = rollout(policy, reset(key_reset), key_play, LIMIT + 1)
+  _, slots = rollout(policy, reset(key_reset, held=held), key_play, LIMIT + 1)
   return jnp.mean(jnp.any(slots.timestep.terminated, axis=0))
 
 
-def begin(agent: Agent, key: Array):
+def begin(agent: Agent, key: Array, *, held: bool):
   """Learner, worlds, empty replay and the expert's replay."""
   keys = jax.random.split(key, 3)
-  world = reset(keys[0])
+  world = reset(keys[0], held=held)
   state = agent.init(keys[1], world.timestep.observation)
   _, slots = rollout(expert, world, keys[2], 64)
   example = jax.tree.map(lambda x: x[0, 0], slots)
@@ -202,11 +204,11 @@ def test_expert_and_random_choice_frame_the_task():
   assert rates[1] < 0.2
 
 
-def learn(config: AgentConfig, iterations: int, seed: int = 0):
+def learn(config: AgentConfig, iterations: int, *, held: bool = False):
   """Success rates before and after training, and the metrics of each iteration."""
   agent = make_agent(config)
-  key_begin, key_train, key_test = jax.random.split(jax.random.key(seed), 3)
-  carry = jax.jit(functools.partial(begin, agent))(key_begin)
+  key_begin, key_train, key_test = jax.random.split(jax.random.key(0), 3)
+  carry = jax.jit(functools.partial(begin, agent, held=held))(key_begin)
 
   @jax.jit
   def train(carry):
@@ -215,7 +217,7 @@ def learn(config: AgentConfig, iterations: int, seed: int = 0):
 
   @jax.jit
   def rate(state: LearnerState) -> Array:
-    each = jax.vmap(lambda key: success_rate(learned(agent, state), key))
+    each = jax.vmap(lambda key: success_rate(learned(agent, state), key, held=held))
     return jnp.mean(each(jax.random.split(key_test, 8)))
 
   before = rate(carry[0])

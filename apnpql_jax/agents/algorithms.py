@@ -68,7 +68,8 @@ class Algorithm:
 
 
 ALGORITHMS = {
-  # regulariser,   policy,        regulariser update, policy update, policy evaluation
+  # regulariser      policy          regulariser       policy      policy
+  #                                  update            update      evaluation
   "ap_npql": Algorithm(
     behaviour_prior, non_parametric, fit_candidates,   none,       Categorical,
   ),

@@ -12,11 +12,7 @@ import jax.numpy as jnp
 import optax
 
 from apnpql_jax.agents import objectives
-from apnpql_jax.agents.algorithms import (
-  Algorithm,
-  algorithm_of,
-  epsilon_is_bounded,
-)
+from apnpql_jax.agents.algorithms import Algorithm, algorithm_of, epsilon_is_bounded
 from apnpql_jax.agents.networks import Heads, Networks, Params, make_networks
 from apnpql_jax.agents.policies import Candidates
 from apnpql_jax.config import AgentConfig, TrainConfig, validate
@@ -235,6 +231,7 @@ def total_loss(
     "npql/alpha_mean": heads.alpha(),
     "npql/max_weight": jnp.max(weights, axis=0),
     "prior/entropy": prior.entropy_bound(),
+    "policy/entropy": improved.entropy,
     "q/mean": jnp.mean(q_values, axis=0),
     "q/data": evaluation.value(outputs),
     "q/target": evaluation.expected(target),

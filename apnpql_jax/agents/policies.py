@@ -39,6 +39,12 @@ class Candidates(struct.PyTreeNode):
     """E[Q] under the policy, f32[*b]."""
     return jnp.sum(self.weights * self.q_values, axis=0)
 
+  @property
+  def entropy(self) -> Array:
+    """Estimate of the policy's entropy in nats, f32[*b]."""
+    surprise = -self.log_prob(self.samples, self.q_values)
+    return jnp.sum(self.weights * surprise, axis=0)
+
   def log_prob(self, actions: Array, q_values: Array) -> Array:
     """Log density of actions f32[T, *b, 7] with values f32[T, *b]: f32[T, *b].
 

@@ -23,6 +23,7 @@ class Improvement(struct.PyTreeNode):
 
   candidates: Candidates  # of q, or of pi_psi where the KL is the reverse one
   kl: Array  # f32[*b]: from that policy to the regulariser, nats
+  entropy: Array  # f32[*b]: of q, or of pi_psi where there is one, nats
   losses: dict[str, Array]  # f32[*b] each
 
 
@@ -31,7 +32,8 @@ def none(heads: Heads, prior: ActionDistribution, key: Array) -> Improvement:
   config = heads.config
   q = non_parametric(heads, prior, key, num_samples=config.policy_samples)
   dual = objectives.alpha_loss(q.q_values, heads.alpha(), epsilon=config.epsilon)
-  return Improvement(q, boltzmann.kl_to_prior(q.weights), {"loss/alpha": dual})
+  kl = boltzmann.kl_to_prior(q.weights)
+  return Improvement(q, kl, q.entropy, {"loss/alpha": dual})
 
 
 def forward_kl(heads: Heads, prior: ActionDistribution, key: Array) -> Improvement:
@@ -40,9 +42,11 @@ def forward_kl(heads: Heads, prior: ActionDistribution, key: Array) -> Improveme
   The candidates are those of q, drawn from the regulariser.
   """
   step = none(heads, prior, key)
-  q = step.candidates
-  fit = objectives.weighted_nll(heads.policy(), q.samples, q.weights)
-  return step.replace(losses={**step.losses, "loss/policy": fit})
+  q, policy = step.candidates, heads.policy()
+  fit = objectives.weighted_nll(policy, q.samples, q.weights)
+  return step.replace(
+    entropy=policy.entropy_bound(), losses={**step.losses, "loss/policy": fit}
+  )
 
 
 def reverse_kl(heads: Heads, prior: ActionDistribution, key: Array) -> Improvement:
@@ -63,4 +67,4 @@ def reverse_kl(heads: Heads, prior: ActionDistribution, key: Array) -> Improveme
     "loss/policy": jax.lax.stop_gradient(alpha) * kl - pi.value,
     "loss/alpha": objectives.kl_dual(kl, alpha, epsilon=config.epsilon),
   }
-  return Improvement(pi, kl, losses)
+  return Improvement(pi, kl, pi.base.entropy_bound(), losses)

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from apnpql_jax.agents import objectives, policies
 from apnpql_jax.agents.networks import Heads
 from apnpql_jax.agents.policies import Candidates
@@ -33,16 +35,8 @@ def uniform(heads: Heads, slow: Heads) -> UniformBox:
   return UniformBox(heads.phi.shape[:-1], ARM_DOF)
 
 
-def no_update(
-  heads: Heads,
-  prior: ActionDistribution,
-  candidates: Candidates,
-  batch: Transition,
-  key: Array,
-  nu: Array,
-) -> Losses:
+def no_update(*_: Any) -> Losses:
   """For regularisers without parameters of their own."""
-  del heads, prior, candidates, batch, key, nu
   return {}
 
 

@@ -73,7 +73,7 @@ def transitions(key: Array) -> Transition:
     ],
     axis=-1,
   )
-  labels = jnp.zeros((BATCH, 3, 6)).at[..., :2].set(jnp.array(PRIMITIVES)[None])
+  labels = jnp.zeros((BATCH, 3, 7)).at[..., :2].set(jnp.array(PRIMITIVES)[None])
   return Transition(
     observation_tm1=observation(BATCH),
     action_tm1=actions,
