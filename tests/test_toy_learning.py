@@ -8,11 +8,13 @@ the object, the goal and a neutral place. A quarter of each batch is an expert's
 from __future__ import annotations
 
 from collections.abc import Callable
+import dataclasses
 import functools
 
 from flax import struct
 import jax
 import jax.numpy as jnp
+import pytest
 
 from apnpql_jax import replay
 from apnpql_jax.agents.learner import Agent, LearnerState, make_agent
@@ -231,3 +233,24 @@ def test_agent_learns_to_carry_the_object_to_the_goal():
   assert after > 0.9
   # It was the algorithm, not only the primitives: the KL limit is in force.
   assert jnp.mean(metrics["npql/kl_over_eps"][-50:]) > 0.7
+
+
+@pytest.mark.parametrize(
+  ("algorithm", "epsilon"), [("ap_mpo", 1.5), ("ap_sac", 6.0), ("sac", 8.0)]
+)
+def test_every_algorithm_of_the_paper_learns_half_of_the_task(algorithm, epsilon):
+  """The object is in the hand from the start: keep it, and find the goal."""
+  config = dataclasses.replace(
+    CONFIG,
+    algorithm=algorithm,
+    epsilon=epsilon,
+    hidden=(64, 64),
+    feature_dim=64,
+    target_samples=16,
+    policy_samples=16,
+    num_atoms=21,
+    learning_rate_alpha=3e-4,
+  )
+  before, after, _ = learn(config, 200, held=True)
+  assert before < 0.1
+  assert after > 0.8
