@@ -60,7 +60,7 @@ def test_a_run_killed_at_random_moments_ends_as_if_nothing_had_been(tmp_path, ki
   assert f"saved at step {stopped:,}; to go on: --resume {run}" in said.read_text()
 
   # Evaluations are none of the training's business.
-  total = str(tiny.rows(run)[-1]["step"] + 4 * tiny.STEPS)
+  total = str(tiny.rows(run)[-1]["step"] + 16 * tiny.STEPS)
   other = ["--total-steps", total, "--eval-episodes", "2"]
   straight, log = tmp_path / "straight", tmp_path / "log"
   together = [
