@@ -39,6 +39,7 @@ class TrainState(struct.PyTreeNode):
 
 
 Iteration = Callable[[TrainState], tuple[TrainState, Metrics]]
+ExpertReplay = Callable[[TrainConfig, Env, Array], Replay | None]
 
 
 def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
@@ -127,9 +128,9 @@ def _rollout_metrics(chunk: Slot) -> Metrics:
 
 
 def initial_state(
-  config: TrainConfig, env: Env, agent: Agent, expert_replay: Replay | None = None
+  config: TrainConfig, env: Env, agent: Agent, expert: ExpertReplay
 ) -> TrainState:
-  """The state before the first iteration; collects the expert's replay if None."""
+  """The state before the first iteration; ``expert`` fills the expert's replay."""
   key, *keys = jax.random.split(jax.random.key(config.seed), 5)
   rows = jax.random.randint(keys[0], (config.env.worlds,), 0, env.bank_split)
   worlds = jax.jit(env.reset)(rows)
@@ -139,7 +140,7 @@ def initial_state(
     learner=jax.jit(agent.init)(keys[1], worlds.timestep.observation),
     env=worlds,
     replay=replay.create(slot, length, config.env.worlds),
-    expert_replay=expert_replay or collect_expert(config, env, keys[2]),
+    expert_replay=expert(config, env, keys[2]),
     key=key,
     env_steps=jnp.zeros((), jnp.int32),
     faults=Faults(in_a_row=jnp.zeros((), jnp.int32), key=keys[3]),
@@ -154,6 +155,17 @@ def example_slot(worlds: EnvState) -> Slot:
     lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), worlds.timestep
   )
   return Slot(timestep=timestep, action=action, log_prob=log_prob)
+
+
+def empty_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:
+  """An expert's replay with nothing in it, for who needs its shapes only."""
+  del key
+  worlds = config.env.worlds
+  length = config.replay.expert_steps // worlds
+  if not length:
+    return None
+  state = jax.eval_shape(env.reset, jnp.zeros(worlds, jnp.int32))
+  return replay.create(example_slot(state), length, worlds)
 
 
 def collect_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:

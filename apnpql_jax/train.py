@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Generator
 import contextlib
 import dataclasses
-import functools
 import logging
 from pathlib import Path
 import signal
@@ -34,7 +33,14 @@ from apnpql_jax.checkpoint_writer import CheckpointWriter
 from apnpql_jax.config import TrainConfig
 from apnpql_jax.env import Env, make_env
 from apnpql_jax.extra_sinks import check_sinks, make_sinks
-from apnpql_jax.iteration import TrainState, initial_state, make_iteration
+from apnpql_jax.iteration import (
+  ExpertReplay,
+  TrainState,
+  collect_expert,
+  empty_expert,
+  initial_state,
+  make_iteration,
+)
 from apnpql_jax.metrics import MetricWriter
 from apnpql_jax.progress import TrainProgress
 from apnpql_jax.reporter import Reporter
@@ -123,8 +129,7 @@ def _start(
   if saved:
     checkpoint.check(run_dir, None, config=config)
   env, agent = make_env(config.env), make_agent(config.agent)
-  build = functools.partial(initial_state, config, env, agent)
-  example = jax.eval_shape(build)
+  example = jax.eval_shape(lambda: initial_state(config, env, agent, empty_expert))
   memory.check_memory(leaves.nbytes(example), "the training state")
   if resume:
     folder = run_folder.open_run(run_dir)
@@ -133,19 +138,23 @@ def _start(
   if saved:
     state = _restore(config, run_dir, example)
     return Start(env, agent, folder, state, int(state.env_steps))
-  expert_replay = None
-  if path := config.replay.demonstrations:
-    demos = demonstrations.load(Path(path), env)
-    _say(f"{demos.instants} instants of {path} for {config.replay.expert_steps} slots")
-    expert_replay = demonstrations.make_replay(demos, config, env)
-  else:
-    _say("collecting the expert's replay")
-  state = build(expert_replay)
+  state = initial_state(config, env, agent, _expert(config, env))
   if resume:
     _say("it was stopped before its first checkpoint, and begins again")
     return Start(env, agent, folder, state, 0)
   folder = run_folder.create(run_dir, config, overwrite=overwrite)
   return Start(env, agent, folder, state, None)
+
+
+def _expert(config: TrainConfig, env: Env) -> ExpertReplay:
+  """How the expert's replay is filled: from a file, or by the scripted expert."""
+  if not config.replay.demonstrations:
+    _say("collecting the expert's replay")
+    return collect_expert
+  path = Path(config.replay.demonstrations)
+  demos = demonstrations.load(path, env)
+  _say(f"{demos.instants} instants of {path} for {config.replay.expert_steps} slots")
+  return lambda config, env, _: demonstrations.make_replay(demos, config, env)
 
 
 def _loop(config, iteration, state, reporter, saver, caught) -> TrainState:

@@ -23,7 +23,13 @@ from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.checkpoint_writer import CheckpointWriter
 from apnpql_jax.config import ConfigError, TrainConfig
 from apnpql_jax.env import Env, make_env
-from apnpql_jax.iteration import TrainState, initial_state, make_iteration, make_sample
+from apnpql_jax.iteration import (
+  TrainState,
+  collect_expert,
+  initial_state,
+  make_iteration,
+  make_sample,
+)
 
 WORLDS, LENGTH = tiny.CONFIG.env.worlds, tiny.CONFIG.rollout_length
 
@@ -55,7 +61,7 @@ def built(request) -> Built:
     max_skipped_updates=2,
   )
   env, agent = make_env(config.env), make_agent(config.agent)
-  state = initial_state(config, env, agent)
+  state = initial_state(config, env, agent, collect_expert)
   jitted: Any = make_iteration(config, env, agent)
   iteration = jitted.lower(state).compile(compiler_options=tiny.FAST_COMPILE)
   for _ in range(3):
@@ -149,7 +155,7 @@ def test_without_its_replay_a_state_goes_on_with_an_older_one(
   example = jax.eval_shape(lambda: jax.tree.map(jnp.copy, after))
   restored = train._restore(built.config, tmp_path, example)
   assert "its replay is that of step 24" in capsys.readouterr().err
-  assert _bits(restored.replace(replay=0)) == _bits(after.replace(replay=0))
+  assert _bits(restored.replace(replay=None)) == _bits(after.replace(replay=None))
   assert int(restored.replay.cursor) == int(before.replay.cursor)
   # What is added next does not follow on the newest instant, which is now an end.
   held, kept = (x.replay.slots.timestep.truncated for x in (restored, before))

@@ -60,12 +60,12 @@ def test_a_run_killed_at_random_moments_ends_as_if_nothing_had_been(tmp_path, ki
   assert f"saved at step {stopped:,}; to go on: --resume {run}" in said.read_text()
 
   # Evaluations are none of the training's business.
-  total = str(tiny.rows(run)[-1]["step"] + 4 * tiny.STEPS)
-  other = ["--eval-episodes", "2", "--checkpoint-every", "1000000"]
-  straight = tmp_path / "straight"
+  total = str(tiny.rows(run)[-1]["step"] + 16 * tiny.STEPS)
+  other = ["--total-steps", total, "--eval-episodes", "2"]
+  straight, log = tmp_path / "straight", tmp_path / "log"
   together = [
     tiny.start(run, "--total-steps", total, said=said),
-    tiny.start(straight, "--total-steps", total, *other, said=tmp_path / "said2"),
+    tiny.start(straight, *other, said=log, log_compiles=True),
   ]
   for process in together:
     _finish(process, said)
@@ -77,3 +77,7 @@ def test_a_run_killed_at_random_moments_ends_as_if_nothing_had_been(tmp_path, ki
     for folder in (run, straight)
   ]
   assert losses[0] == losses[1] and len(losses[0]) == int(total) // tiny.STEPS
+  # After the first iteration nothing was compiled but the evaluation.
+  compiled = log.read_text().partition(" 8 of ")[2].count("Finished XLA compilation")
+  assert log.read_text().count("compilation of jit(iteration)") == 1
+  assert 0 < compiled < 8 < len(losses[1])

@@ -59,7 +59,9 @@ _PRESET_ARGS = (
 ).split()
 
 
-def start(run_dir: Path, *args: str, said: Path) -> subprocess.Popen[bytes]:
+def start(
+  run_dir: Path, *args: str, said: Path, log_compiles: bool = False
+) -> subprocess.Popen[bytes]:
   """Trains in a new process, or goes on if ``run_dir`` is a run; stderr to ``said``."""
   command = [sys.executable, "-m", "apnpql_jax", "train"]
   if (run_dir / "config.json").exists():
@@ -68,6 +70,7 @@ def start(run_dir: Path, *args: str, said: Path) -> subprocess.Popen[bytes]:
     command += ["push_plate", "--run", str(run_dir), *_PRESET_ARGS]
   flags = " ".join(f"--{name}={value}" for name, value in FAST_COMPILE.items())
   env = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": str(ROOT)}
+  env |= {"JAX_LOG_COMPILES": "1"} if log_compiles else {}
   with said.open("ab") as file:
     return subprocess.Popen(
       [*command, *args], cwd=said.parent, env=env, stdout=file, stderr=file
