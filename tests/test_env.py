@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 from apnpql_jax.config import EnvConfig
 from apnpql_jax.env import Env, make_env
@@ -38,6 +39,17 @@ def pixel_chunk(env):
 
 def test_held_out_rows_are_never_trained_on(env):
   assert env.bank_split == 192 and env.held_out == 64
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.0])
+def test_density_of_the_expert_is_that_of_its_noise(env, noise: float):
+  """Without noise it is so high that no other policy comes near."""
+  state = env.reset(jnp.arange(16))
+  action, log_prob = expert_policy(env, noise=noise)(state, jax.random.key(0))
+  mean = env.expert_action(state)[..., :6]
+  expected = stats.norm.logpdf(action[..., :6], mean, max(noise, 1e-6)).sum(-1)
+  np.testing.assert_allclose(log_prob, expected, rtol=1e-3)
+  assert np.all(np.asarray(log_prob) > 60.0) == (noise == 0.0)
 
 
 def test_time_out_truncates_then_resets(env):

@@ -184,3 +184,16 @@ def test_nu_grows_while_the_entropy_is_below_its_floor(entropy: float, sign: flo
   )(jnp.float32(1.0))
   assert slope == pytest.approx(entropy - 0.5)
   assert np.sign(-slope) == sign
+
+
+def test_both_duals_of_the_limit_have_its_slack_as_their_slope():
+  """Eq. 7 for q, and the dual for a parametric policy, given the same KL."""
+  q, alpha = random_array(11, 30, 5), jnp.linspace(0.2, 2.0, 5)
+  kl = boltzmann.kl_to_prior(boltzmann.importance_weights(q, alpha))
+  of_q, of_pi = (
+    jax.grad(lambda a, f=f, x=x: jnp.sum(f(x, a, epsilon=0.7)))(alpha)
+    for f, x in ((objectives.alpha_loss, q), (objectives.kl_dual, kl))
+  )
+  np.testing.assert_allclose(of_q, of_pi, atol=1e-4)
+  np.testing.assert_allclose(of_pi, 0.7 - kl, atol=1e-5)
+  assert np.any(kl > 0.7) and np.any(kl < 0.7)
