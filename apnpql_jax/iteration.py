@@ -56,23 +56,8 @@ def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
       env, policy, state.env, rollout_key, length=config.rollout_length
     )
     ring = _remember(state.replay, state.env, worlds, chunk)
-
-    def update(carry: tuple[LearnerState, Faults], key: Array) -> Any:
-      learner, faults = carry
-      sample_key, learn_key = jax.random.split(key)
-      batch = sample(ring, state.expert_replay, sample_key)
-      updated, metrics = agent.update(learner, batch, learn_key)
-      # A gradient that is not finite leaves moments and parameters that are not; a
-      # reward that is not, however, can get lost in the limits of the projection.
-      ok = all_finite((batch, updated))
-      learner = jax.tree.map(functools.partial(jnp.where, ok), updated, learner)
-      faults = Faults(
-        in_a_row=jnp.where(ok, 0, faults.in_a_row + 1),
-        key=jnp.where(ok, faults.key, key),
-      )
-      return (learner, faults), (metrics, ok)
-
     keys = jax.random.split(update_key, config.updates_per_iteration)
+    update = functools.partial(_update, agent, sample, ring, state.expert_replay)
     (learner, faults), (metrics, ok) = jax.lax.scan(
       update, (state.learner, state.faults), keys
     )
@@ -93,6 +78,23 @@ def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
     ), metrics
 
   return jax.jit(iteration, donate_argnums=0)
+
+
+def _update(agent, sample, ring, expert_replay, carry, key) -> Any:
+  """One update for ``scan``: it is skipped, and counted, if it is not finite."""
+  learner, faults = carry
+  sample_key, learn_key = jax.random.split(key)
+  batch = sample(ring, expert_replay, sample_key)
+  updated, metrics = agent.update(learner, batch, learn_key)
+  # A gradient that is not finite leaves moments and parameters that are not; a reward
+  # that is not, however, can get lost in the limits of the projection.
+  ok = all_finite((batch, updated))
+  learner = jax.tree.map(functools.partial(jnp.where, ok), updated, learner)
+  faults = Faults(
+    in_a_row=jnp.where(ok, 0, faults.in_a_row + 1),
+    key=jnp.where(ok, faults.key, key),
+  )
+  return (learner, faults), (metrics, ok)
 
 
 def make_sample(config: TrainConfig, agent: Agent) -> Callable[..., Transition]:

@@ -80,29 +80,9 @@ def train(
       on, and its checkpoints are as they were.
   """
   start = _start(config, run_dir, resume=resume, overwrite=overwrite)
-  folder = start.folder
-  _say(f"run folder {folder.path}; compiling, which takes a minute or two")
+  _say(f"run folder {start.folder.path}; compiling, which takes a minute or two")
   try:
-    with (
-      MetricWriter(
-        folder.path,
-        resume_step=start.resume_step,
-        sinks=make_sinks(config.sinks, folder.path, dict(codec.flatten(config))),
-      ) as writer,
-      CheckpointWriter(
-        folder.path,
-        config,
-        keep=config.keep_checkpoints,
-        resume_step=start.resume_step,
-      ) as saver,
-      TrainProgress(config.total_steps) as progress,
-      caught_signals() as caught,
-    ):
-      reporter = Reporter(config, start.env, start.agent, folder, writer, progress)
-      iteration = make_iteration(config, start.env, start.agent)
-      state = _loop(config, iteration, start.state, reporter, saver, caught)
-      if figures := saver.finished(wait=True):
-        writer.write(int(state.env_steps), figures)
+    state, evaluation, caught = _run(config, start)
   except OSError as error:  # The disk is full or gone.
     raise RunStopped(f"{error}; {_how_to_go_on(run_dir)}", runs.FAILED) from error
   if caught:
@@ -111,11 +91,34 @@ def train(
       runs.INTERRUPTED + caught[0],
     )
   return {
-    "run": str(folder.path),
+    "run": str(start.folder.path),
     "env_steps": int(state.env_steps),
     "updates": int(state.learner.step),
-    **reporter.evaluation,
+    **evaluation,
   }
+
+
+def _run(
+  config: TrainConfig, start: Start
+) -> tuple[TrainState, dict[str, Any], list[int]]:
+  """Opens what is written to, and trains; the last evaluation and signals caught."""
+  path, resume_step = start.folder.path, start.resume_step
+  sinks = make_sinks(config.sinks, path, dict(codec.flatten(config)))
+  with (
+    MetricWriter(path, resume_step=resume_step, sinks=sinks) as writer,
+    CheckpointWriter(
+      path, config, keep=config.keep_checkpoints, resume_step=resume_step
+    ) as saver,
+    TrainProgress(config.total_steps) as progress,
+    caught_signals() as caught,
+  ):
+    env, agent = start.env, start.agent
+    reporter = Reporter(config, env, agent, start.folder, writer, progress)
+    iteration = make_iteration(config, env, agent)
+    state = _loop(config, iteration, start.state, reporter, saver, caught)
+    if figures := saver.finished(wait=True):
+      writer.write(int(state.env_steps), figures)
+  return state, reporter.evaluation, caught
 
 
 def _start(
