@@ -365,9 +365,9 @@ FUNNEL_WIDTH = FUNNEL - ALIGNED
     ((0.031, 0.0, 0.02), OPEN, 0.0, 0.5),
     ((-0.01, 0.0, 0.07), OPEN, 0.0, 0.0),
     ((0.0, 0.0, 0.0), OPEN, 0.0, 0.0),
-    # Only as far down as the fingers are turned across the plate.
-    ((0.0, 0.0, 0.07), OPEN, 0.5, (0.05 * 0.5 - 0.012) / FUNNEL_WIDTH),
-    ((0.0, 0.02, 0.07), OPEN, -0.3, (0.02 + 0.05 * 0.3 - 0.012) / FUNNEL_WIDTH),
+    # Only as far down as the fingers are turned across the plate, 0.06 rad for nothing.
+    ((0.0, 0.0, 0.07), OPEN, 0.5, (0.05 * 0.44 - 0.012) / FUNNEL_WIDTH),
+    ((0.0, 0.02, 0.07), OPEN, -0.3, (0.02 + 0.05 * 0.24 - 0.012) / FUNNEL_WIDTH),
     ((0.0, 0.0, 0.07), OPEN, 0.5 * np.pi, 1.0),
     ((0.0, 0.0, 0.07), OPEN, -np.pi, 0.0),
     # Fingers closed on nothing do not descend.

@@ -284,16 +284,18 @@ FUNNEL_WIDTH = FUNNEL - ALIGNED
     ((0.031, 0.0, 0.02), OPEN, 0.0, 0.5),
     ((-0.01, 0.0, 0.07), OPEN, 0.0, 0.0),
     ((0.0, 0.0, 0.0), OPEN, 0.0, 0.0),
-    # Only as far down as the fingers are turned to the faces.
-    ((0.0, 0.0, 0.07), OPEN, 0.3, (0.05 * 0.3 - 0.012) / FUNNEL_WIDTH),
-    ((0.0, 0.02, 0.07), OPEN, -0.3, (0.02 + 0.05 * 0.3 - 0.012) / FUNNEL_WIDTH),
+    # Only as far down as the fingers are turned to the faces, 0.125 rad for nothing.
+    ((0.0, 0.0, 0.07), OPEN, 0.12, 0.0),
+    ((0.0, 0.0, 0.07), OPEN, 0.6, (0.05 * 0.475 - 0.012) / FUNNEL_WIDTH),
+    ((0.0, 0.02, 0.07), OPEN, -0.3, (0.02 + 0.05 * 0.175 - 0.012) / FUNNEL_WIDTH),
     ((0.0, 0.0, 0.07), OPEN, 1.5 * np.pi, 0.0),
     # Fingers closed on nothing do not descend.
     ((0.0, 0.0, 0.07), 0.02, 0.0, 1.0),
     ((0.0, 0.0, 0.07), 0.07, 0.0, 1.0),
     # Fingers that close around the box stay, unless they are turned away from it.
     ((0.0, 0.0, 0.005), 0.07, 0.05, 0.0),
-    ((0.0, 0.0, 0.0), 0.07, 0.2, 1.0),
+    ((0.0, 0.0, 0.0), 0.07, 0.2, 0.0),
+    ((0.0, 0.0, 0.0), 0.07, 0.3, 1.0),
     # So do those that have it, also if they have slipped by 2 cm.
     ((0.0, 0.0, 0.0), stack_box.SIDE, 0.0, 0.0),
     ((0.02, 0.0, 0.0), stack_box.SIDE, 0.0, 0.008 / FUNNEL_WIDTH),

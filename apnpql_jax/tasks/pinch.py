@@ -16,7 +16,7 @@ TOLERANCE = 0.004
 CLEARANCE = 0.02
 """m; an open hand leaves this much, both sides together."""
 
-NEAR = 0.015
+NEAR = 0.012
 """m; the hand may close when its pinch point is this close to where it shall grip. What
 stands freely is centred by the closing pads, and a policy that sees a pixel per
 centimetre hardly comes closer."""
