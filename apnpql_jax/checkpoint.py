@@ -162,6 +162,8 @@ def _restore_item(run_dir: Path, step: int, item: str, example: Any) -> Any:
     with ocp.StandardCheckpointer() as reader:
       path = checkpoint_record.folder(run_dir) / str(step) / item
       tree = reader.restore(path, leaves.abstract(example))
+  except (MemoryError, PermissionError):
+    raise  # No fault of the checkpoint's.
   except Exception as error:  # Whatever Orbax or the file system found wrong.
     raise DamagedError(f"{name} cannot be read: {first_line(error)}") from error
   checkpoint_record.check_bits(name, saved, tree)

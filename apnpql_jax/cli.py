@@ -175,7 +175,7 @@ def repeat(args: Repeat, argv: Sequence[str]) -> Json:
   if not args.file:
     raise ConfigError("repeat needs a file: apnpql repeat RUN/faults/step_<n>.npz")
   path = Path(args.file).absolute()
-  runs.load_run_config(path.parents[1])
+  runs.load_run_config(path.absolute().parent.parent)
 
   from apnpql_jax import faults
 

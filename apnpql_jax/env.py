@@ -162,12 +162,11 @@ class Env:
     """bool[worlds]: everything is finite, and the engine has not started over.
 
     C MuJoCo puts a world that is not finite back to its default pose without a word;
-    its clock then shows less time than has passed.
+    its clock then shows less than before.
     """
     seen = jax.tree.leaves((before.physics, before.targets, action, moved))
     finite = [jnp.isfinite(x).all(tuple(range(1, x.ndim))) for x in seen]
-    passed = moved.time - before.physics.time
-    return jnp.stack(finite).all(0) & (passed > 0.5 * self.config.control_period_s)
+    return jnp.stack(finite).all(0) & (moved.time > before.physics.time)
 
   def _arrive(
     self,

@@ -64,7 +64,7 @@ def repeat(path: Path) -> dict[str, list[str]]:
   Raises:
     ConfigError: it is no such file, or does not lie in its run folder.
   """
-  config = runs.load_run_config(path.absolute().parents[1])
+  config = runs.load_run_config(path.absolute().parent.parent)
   arrays = npz.read(path, limit=_MAX_BYTES)
   agent = make_agent(config.agent)
   try:

@@ -86,9 +86,10 @@ def _update(agent, sample, ring, expert_replay, carry, key) -> Any:
   sample_key, learn_key = jax.random.split(key)
   batch = sample(ring, expert_replay, sample_key)
   updated, metrics = agent.update(learner, batch, learn_key)
-  # A gradient that is not finite leaves moments and parameters that are not; a reward
-  # that is not, however, can get lost in the limits of the projection.
-  ok = all_finite((batch, updated))
+  # The norms of the gradients tell of all losses and parameters; a reward that is not
+  # finite, however, can get lost in the limits of the projection.
+  norms = {k: v for k, v in metrics.items() if k.startswith("grad_norm/")}
+  ok = all_finite((batch, norms, updated.nu))
   learner = jax.tree.map(functools.partial(jnp.where, ok), updated, learner)
   faults = Faults(
     in_a_row=jnp.where(ok, 0, faults.in_a_row + 1),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+import tokenize
 import zipfile
 import zlib
 
@@ -13,6 +14,7 @@ from apnpql_jax.config import ConfigError
 
 _ERRORS = (OSError, ValueError, EOFError, KeyError, RuntimeError, MemoryError)
 _ERRORS += (NotImplementedError, zipfile.BadZipFile, zlib.error)
+_ERRORS += (LookupError, SyntaxError, TypeError, tokenize.TokenError)
 """What zipfile and NumPy raise at archives that are none."""
 
 

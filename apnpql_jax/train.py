@@ -85,7 +85,7 @@ def train(
     state, evaluation, caught = _run(config, start)
   except OSError as error:  # The disk is full or gone.
     raise RunStopped(f"{error}; {_how_to_go_on(run_dir)}", runs.FAILED) from error
-  if caught:
+  if caught and int(state.env_steps) < config.total_steps:
     raise RunStopped(
       f"saved at step {int(state.env_steps):,}; {_how_to_go_on(run_dir)}",
       runs.INTERRUPTED + caught[0],
@@ -128,16 +128,16 @@ def _start(
   # What Orbax logs of a save that fails, tracebacks of each thread, is said by us.
   logging.getLogger("absl").setLevel(logging.CRITICAL)
   check_sinks(config.sinks)
+  if resume:
+    folder = run_folder.open_run(run_dir)
+    for change in run_folder.changed_versions(folder):
+      _say(f"not as when the run began: {change}")
   saved = resume and checkpoint.latest_step(run_dir) is not None
   if saved:
     checkpoint.check(run_dir, None, config=config)
   env, agent = make_env(config.env), make_agent(config.agent)
   example = jax.eval_shape(lambda: initial_state(config, env, agent, empty_expert))
   memory.check_memory(leaves.nbytes(example), "the training state")
-  if resume:
-    folder = run_folder.open_run(run_dir)
-    for change in run_folder.changed_versions(folder):
-      _say(f"not as when the run began: {change}")
   if saved:
     state = _restore(config, run_dir, example)
     return Start(env, agent, folder, state, int(state.env_steps))

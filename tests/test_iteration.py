@@ -200,6 +200,15 @@ def test_a_broken_world_starts_again_and_its_episode_is_never_drawn(
     assert not (starts[:, None, :] == robot[None]).all(-1).any()
 
 
+def test_a_world_that_breaks_in_its_first_period_is_found(built, iteration, state):
+  """C MuJoCo starts such a world over; its clock must not look like a first period."""
+  fresh = jax.jit(built.env.reset)(jnp.arange(WORLDS))
+  poisoned = _break_world(state.replace(env=fresh), "qvel", 1e12)
+  after, metrics = iteration(poisoned)
+  assert metrics["faults/worlds"] == 1
+  np.testing.assert_array_equal(after.env.faults, [0, 1, 0, 0])
+
+
 def test_the_native_engine_alone_would_not_have_told(built, state):
   """C MuJoCo goes on from its default pose, finite; an action it takes for none."""
   if built.env.physics.name != "native":

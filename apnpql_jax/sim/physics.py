@@ -42,6 +42,11 @@ FINGER_LENGTH = 0.057
 FINGER_ANGLE = np.pi / 6
 
 
+START_TIME = 1.0
+"""s; clocks begin above zero, where C MuJoCo puts that of a world it has reset, so that
+such a reset shows even in the first period."""
+
+
 class PhysicsState(struct.PyTreeNode):
   """Everything an engine needs to go on."""
 
@@ -50,7 +55,7 @@ class PhysicsState(struct.PyTreeNode):
   qacc_warmstart: Array  # f32[*b, nv]
   mocap_pos: Array  # f32[*b, nmocap, 3]
   mocap_quat: Array  # f32[*b, nmocap, 4]
-  time: Array  # f32[*b], s since the reset
+  time: Array  # f32[*b], s since the reset, plus START_TIME
   fields: dict[str, Array]  # model fields that differ between worlds, [*b, ...]
 
 
@@ -109,7 +114,7 @@ def initial_state(
     qacc_warmstart=jnp.zeros((*batch, model.nv)),
     mocap_pos=mocap_pos,
     mocap_quat=mocap_quat,
-    time=jnp.zeros(batch),
+    time=jnp.full(batch, START_TIME),
     fields={k: jnp.asarray(v)[variant] for k, v in scene.variants.items()},
   )
 
