@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import json
@@ -256,9 +257,12 @@ def test_progress_draws_a_bar_on_a_terminal():
       clock.now += 10.0
       progress.update(500, updates=100, success_rate=0.5)
       progress.message("a [bracketed] note")
-    stream.flush()
-    shown = os.read(controller, 2**16).decode()
+  shown = b""
+  with contextlib.suppress(OSError):  # Raised at the end, for the terminal is closed.
+    while part := os.read(controller, 2**16):
+      shown += part
   os.close(controller)
+  shown = shown.decode()
   assert "50%" in shown and "500 steps" in shown and "success 50 %" in shown
   assert "a [bracketed] note" in shown and "\x1b[" in shown
 
