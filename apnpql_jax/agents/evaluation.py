@@ -72,24 +72,29 @@ class Categorical:
     )
 
   def head(self, hidden: Sequence[int]) -> nn.Module:
+    """See ``Evaluation``."""
     config = self.config
     atoms = np.linspace(config.v_min, config.v_max, config.num_atoms)
     initial = categorical.broadest_logits(config.initial_value, atoms)
     return ValueHead(hidden, tuple(initial))
 
   def value(self, outputs: Array) -> Array:
+    """See ``Evaluation``."""
     return categorical.mean(jax.nn.softmax(outputs), self.atoms)
 
   def target(self, look: Look, batch: Transition) -> Array:
+    """See ``Evaluation``."""
     _, policy = look(batch.observation_t)
     return objectives.value_target(
       policy.outputs, policy.weights, batch.reward_t, batch.discount_t, self.atoms
     )
 
   def loss(self, outputs: Array, target: Array) -> Array:
+    """See ``Evaluation``."""
     return objectives.q_loss(outputs, target)
 
   def expected(self, target: Array) -> Array:
+    """See ``Evaluation``."""
     return categorical.mean(target, self.atoms)
 
 
@@ -101,20 +106,25 @@ class TD0:
   windows: ClassVar[bool] = False
 
   def head(self, hidden: Sequence[int]) -> nn.Module:
+    """See ``Evaluation``."""
     return ValueHead(hidden, (self.config.initial_value,))
 
   def value(self, outputs: Array) -> Array:
+    """See ``Evaluation``."""
     return jnp.min(outputs, axis=-1)
 
   def target(self, look: Look, batch: Transition) -> Array:
+    """See ``Evaluation``."""
     _, policy = look(batch.observation_t)
     target = batch.reward_t + batch.discount_t * policy.value
     return jax.lax.stop_gradient(target)
 
   def loss(self, outputs: Array, target: Array) -> Array:
+    """See ``Evaluation``."""
     return 0.5 * jnp.sum(jnp.square(outputs - target[..., None]), axis=-1)
 
   def expected(self, target: Array) -> Array:
+    """See ``Evaluation``."""
     return target
 
 
@@ -122,6 +132,7 @@ class ClippedDoubleQ(TD0):
   """Two heads, regressed on one target with the smaller of both (Fujimoto 2018)."""
 
   def head(self, hidden: Sequence[int]) -> nn.Module:
+    """See ``Evaluation``."""
     return TwinValueHeads(hidden, (self.config.initial_value,) * 2)
 
 
@@ -131,6 +142,7 @@ class Retrace(TD0):
   windows: ClassVar[bool] = True
 
   def target(self, look: Look, batch: Transition) -> Array:
+    """See ``Evaluation``."""
     window = batch.window
     if window is None:
       raise ValueError("Retrace needs transitions with a window")

@@ -66,19 +66,24 @@ def mixture_from_outputs(
   log_std = one_way_clip(
     log_std + math.log(initial_std), math.log(min_std), math.log(max_std)
   )
-  rows, columns = jnp.tril_indices(dim, k=-1)
-  direction = jnp.broadcast_to(jnp.eye(dim, dtype=mean.dtype), (*mean.shape, dim))
-  if not diagonal:
-    direction = direction.at[..., rows, columns].set(one_way_clip(below, -1.0, 1.0))
-  length = jnp.sqrt(jnp.sum(jnp.square(direction), axis=-1, keepdims=True))
   widest = 0.5 * math.log((1.0 - (num - 1) * min_prob) / min_prob)
   logits = one_way_clip(logits[..., 0], -widest, widest)
   return GripperGMM(
     logits=jax.nn.log_softmax(logits),
     mean=mean,
-    scale_tril=jnp.exp(log_std)[..., None] / length * direction,
+    scale_tril=_scale_tril(log_std, jnp.zeros_like(below) if diagonal else below),
     gripper_logits=one_way_clip(close + gripper[..., 0], -surest, surest),
   )
+
+
+def _scale_tril(log_std: Array, below: Array) -> Array:
+  """Cholesky factors f32[*b, K, D, D] whose rows have the length exp(log_std)."""
+  dim = log_std.shape[-1]
+  rows, columns = jnp.tril_indices(dim, k=-1)
+  direction = jnp.broadcast_to(jnp.eye(dim, dtype=log_std.dtype), (*log_std.shape, dim))
+  direction = direction.at[..., rows, columns].set(one_way_clip(below, -1.0, 1.0))
+  length = jnp.sqrt(jnp.sum(jnp.square(direction), axis=-1, keepdims=True))
+  return jnp.exp(log_std)[..., None] / length * direction
 
 
 def mixture_size(*, own_mean: bool) -> int:

@@ -1,7 +1,7 @@
 """Two places where stock MJX is slower than it need be, mended without copying it.
 
-Both functions are private to mujoco-mjx, hence the narrow patches; the results are the
-same (``tests/test_mjx_patches.py`` compares them).
+Both functions are private to mujoco-mjx, hence the narrow patches. A barrier changes no
+value; ``tests/test_mjx_patches.py`` compares the Newton direction with stock MJX.
 """
 
 from __future__ import annotations
