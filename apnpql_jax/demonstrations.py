@@ -177,7 +177,7 @@ def make_replay(demos: Demonstrations, config: TrainConfig, env: Env) -> Replay:
         truncated=timestep.truncated | ends & ~timestep.terminated
       )
       action = jnp.asarray(demos.action, jnp.float32)[rows]
-      return state, Slot(timestep, action, jnp.full(worlds, CERTAIN))
+      return state, Slot(timestep, action, jnp.full(worlds, CERTAIN, jnp.float32))
 
     start = env.reset(jnp.zeros(worlds, jnp.int32))
     _, chunk = jax.lax.scan(instant, start, (index, fresh, targets, ends))

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import tiny
 
-from apnpql_jax import checkpoint, cli, faults, replay, run_folder, runs, train
+from apnpql_jax import checkpoint, cli, faults, leaves, replay, run_folder, runs, train
 from apnpql_jax.agents.algorithms import ALGORITHMS
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.checkpoint_writer import CheckpointWriter
@@ -26,6 +26,7 @@ from apnpql_jax.env import Env, make_env
 from apnpql_jax.iteration import (
   TrainState,
   collect_expert,
+  empty_expert,
   initial_state,
   make_iteration,
   make_sample,
@@ -119,6 +120,22 @@ def _poison_learner(state: TrainState) -> TrainState:
   params = dict(state.learner.params)
   params["ap"] = jax.tree.map(lambda x: x + jnp.inf, params["ap"])
   return state.replace(learner=state.learner.replace(params=params))
+
+
+def test_the_state_keeps_its_types_so_that_one_compilation_serves_every_iteration(
+  built,
+):
+  agent = make_agent(built.config.agent)
+  start = jax.eval_shape(
+    lambda: initial_state(built.config, built.env, agent, empty_expert)
+  )
+  after, _ = jax.eval_shape(make_iteration(built.config, built.env, agent), start)
+
+  def types(state: TrainState) -> dict[str, tuple]:
+    named = leaves.named(state)
+    return {name: (x.shape, x.dtype, x.weak_type) for name, x in named.items()}
+
+  assert types(start) == types(after)
 
 
 def test_an_iteration_is_a_function_of_its_state(iteration, state):

@@ -114,7 +114,7 @@ def initial_state(
     qacc_warmstart=jnp.zeros((*batch, model.nv)),
     mocap_pos=mocap_pos,
     mocap_quat=mocap_quat,
-    time=jnp.full(batch, START_TIME),
+    time=jnp.full(batch, START_TIME, jnp.float32),
     fields={k: jnp.asarray(v)[variant] for k, v in scene.variants.items()},
   )
 
