@@ -11,9 +11,9 @@ that following one of them never knocks the cup over:
   hands, go behind the place over the goal, at the height of the hand.
 - neutral: the configuration of the keyframe, tool horizontal.
 
-Angles of the hand about its own axis are counted from the one with the camera up. A
-cup upside down is gripped at minus a quarter turn; as the cup turns over, the hand
-turns to plus a quarter.
+Angles of the hand about its own axis are counted from the one with the closing plane
+upright. A cup upside down is gripped at minus a quarter turn, where the camera is above
+the hand; as the cup turns over, the hand turns to plus a quarter.
 """
 
 from __future__ import annotations
@@ -184,12 +184,12 @@ class FlipCup(TableTask):
     return self._placed(state) & at_rest & (away > CLEAR)
 
   def objects(self, state: PhysicsState) -> Array:
-    """f32[worlds, 11]: cup's centre, a point 5 cm towards its mouth, the goal, m, and
+    """f32[worlds, 11]: cup's centre, a pointer towards its mouth, the goal, m, and
     the cup's half width and half height, m."""
     cup = self._cup_pos(state)
     sizes = jnp.stack([self._half_width(state), self._half_height(state)], -1)
     goal = state.mocap_pos[:, self._goal]
-    return jnp.concatenate([cup, cup + 0.05 * self._axis(state), goal, sizes], -1)
+    return jnp.concatenate([cup, geometry.POINTER * self._axis(state), goal, sizes], -1)
 
   def expert(
     self, state: PhysicsState, kinematics: Kinematics, primitives: Array
@@ -288,7 +288,7 @@ def _direction(vector: Array) -> Array:
 
 
 def _hand(reach: Array, roll: Array) -> Array:
-  """Rotation of a tool along ``reach``, turned by ``roll`` from camera up.
+  """Rotation of a tool along ``reach``, turned by ``roll`` from a closing plane upright.
 
   f32[worlds, 3], f32[worlds] -> f32[worlds, 3, 3].
   """

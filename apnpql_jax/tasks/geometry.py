@@ -16,6 +16,10 @@ v^2 / 2 mu g is 0.7 mm at mu = 0.2."""
 REST_TURN = 0.5
 """rad/s."""
 
+POINTER = 0.2
+"""m; a direction is observed as a vector of this length, so that a turn by a few degrees
+weighs as much as a few centimetres."""
+
 
 def norm(x: Array) -> Array:
   """f32[*b, n] -> f32[*b], with a gradient at zero."""

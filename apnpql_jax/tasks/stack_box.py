@@ -129,17 +129,13 @@ class StackBox(TableTask):
     return stacked & on_table & at_rest & (geometry.norm(tool - yellow) > CLEAR)
 
   def objects(self, state: PhysicsState) -> Array:
-    """f32[worlds, 12]: for yellow and blue, xyz of centre and of a face's centre, m.
-
-    The face is the one nearest to the world's x axis: boxes look the same after a
-    quarter turn.
-    """
+    """f32[worlds, 12]: for yellow and blue, xyz of the centre and a pointer along the
+    face nearest to the world's x axis, m: boxes look the same after a quarter turn."""
     parts = []
     for address in (self._yellow, self._blue):
-      centre = state.qpos[:, address : address + 3]
       angle = self._yaw(state, address)
       heading = jnp.stack([jnp.cos(angle), jnp.sin(angle), 0 * angle], -1)
-      parts += [centre, centre + SIDE / 2 * heading]
+      parts += [state.qpos[:, address : address + 3], geometry.POINTER * heading]
     return jnp.concatenate(parts, -1)
 
   def expert(
