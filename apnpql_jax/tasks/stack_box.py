@@ -5,7 +5,7 @@ Primitives, so that following one of them never knocks a box over:
 - object: go above the yellow box, turn the fingers to its faces and, through a
   funnel, down until it is between the open pads; stay there.
 - goal: with the box in hand, lift it over the blue one and, through a funnel, down
-  onto it; with empty hands, go above the blue box.
+  onto it, without turning it; with empty hands, go above the blue box.
 - neutral: the configuration of the keyframe.
 
 A low tool that is not at a box rises first; fingers that are closed on nothing do not
@@ -28,7 +28,7 @@ from apnpql_jax.types import Array
 WORKSPACE = ((0.38, 0.56), (-0.22, 0.22))
 """m; x and y ranges of both boxes, within reach of a vertical tool."""
 
-MAX_YAW = 0.35
+MAX_YAW = 0.25
 """rad; boxes are turned by at most this."""
 
 MIN_DISTANCE = 0.13
@@ -95,7 +95,7 @@ class StackBox(TableTask):
   ) -> tuple[Array, Array, Array]:
     """See ``Task.tool_targets``."""
     yellow, blue = self._yellow_pos(state), self._blue_pos(state)
-    yellow_yaw, blue_yaw = self._yaw(state, self._yellow), self._yaw(state, self._blue)
+    yellow_yaw = self._yaw(state, self._yellow)
     twist = self._hand.twist(kinematics, yellow_yaw, np.pi / 2)
     to_object = self._hand.approach(state, kinematics, yellow, twist)
 
@@ -109,7 +109,7 @@ class StackBox(TableTask):
     to_goal = jnp.where(held[:, None], onto, self._hand.above(kinematics, blue))
 
     positions = self.with_neutral(to_object, to_goal)
-    turns = jnp.stack([yellow_yaw, blue_yaw, 0 * blue_yaw], 1)
+    turns = jnp.stack([yellow_yaw, yellow_yaw * held, 0 * yellow_yaw], 1)
     close = grip(
       around=self._hand.around(kinematics, yellow, twist),
       held=held,
