@@ -65,6 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
       os._exit(stop.code)
     return stop.code
   except KeyboardInterrupt:
+    print("apnpql: interrupted", file=sys.stderr)
     return runs.INTERRUPTED + signal.SIGINT
   except BrokenPipeError:  # The reader of our output left, as `head` does.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
