@@ -15,13 +15,22 @@ from apnpql_jax.signals import Signals
 
 BUSY = """
 import hashlib, sys
+from apnpql_jax import cli, options
 from apnpql_jax.signals import Signals
 
-with Signals("nothing is saved") as signals:
-  if sys.argv[1] == "training":
-    signals.finish_first("stopped at once")
+def busy(*_):
   print("ready", flush=True)
   hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)  # As deaf as a compilation.
+
+def train(*_):
+  with Signals("nothing is saved") as signals:
+    if sys.argv[1] == "training":
+      signals.finish_first("stopped at once")
+    busy()
+
+command = busy if sys.argv[1] == "listing" else train
+cli._COMMANDS["list"] = (options.List, command, None)
+cli.main(["list"])
 """
 
 
@@ -42,12 +51,19 @@ def _said(process: subprocess.Popen[str]) -> list[str]:
   return process.stdout.read().splitlines()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_with_nothing_to_save_the_first_signal_ends_the_process(number):
-  with _busy("compiling") as process:
+@pytest.mark.parametrize(
+  ("phase", "number", "words"),
+  [
+    ("compiling", signal.SIGINT, "nothing is saved"),
+    ("compiling", signal.SIGTERM, "nothing is saved"),
+    ("listing", signal.SIGINT, "interrupted"),
+  ],
+)
+def test_with_nothing_to_save_the_first_signal_ends_the_process(phase, number, words):
+  with _busy(phase) as process:
     process.send_signal(number)
     assert process.wait(10) == 128 + number
-    assert _said(process) == ["apnpql: nothing is saved"]
+    assert _said(process) == [f"apnpql: {words}"]
 
 
 def test_a_second_signal_does_not_wait_but_one_sent_twice_is_one():
