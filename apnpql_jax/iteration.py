@@ -152,7 +152,9 @@ def initial_state(
     ), keys[2]
 
   state, expert_key = start(jax.random.key(config.seed))
-  return state.replace(expert_replay=expert(config, env, expert_key))
+  state = state.replace(expert_replay=expert(config, env, expert_key))
+  # Bound to the device, as a restored state is, so that both make the same program.
+  return jax.device_put(state, jax.devices()[0])
 
 
 def example_slot(worlds: EnvState) -> Slot:

@@ -72,6 +72,7 @@ def built(request) -> Built:
   )
   env, agent = make_env(config.env), make_agent(config.agent)
   state = initial_state(config, env, agent, collect_expert)
+  assert all(x.committed for x in jax.tree.leaves(state))
   jitted: Any = make_iteration(config, env, agent)
   iteration = jitted.lower(state).compile(compiler_options=tiny.FAST_COMPILE)
   for _ in range(3):
@@ -165,6 +166,8 @@ def test_a_state_that_was_saved_goes_on_bit_by_bit(built, iteration, tmp_path):
   example = jax.eval_shape(lambda: jax.tree.map(jnp.copy, built.state))
   restored = resuming.restore(built.config, tmp_path, example, pytest.fail)
   straight = built.state
+  # Otherwise the first resume would compile the iteration again.
+  assert all(x.committed for x in jax.tree.leaves(restored))
   assert _bits(restored) == _bits(straight) and len(_bits(straight)) > 60
   for _ in range(2):
     straight, told = iteration(straight)
