@@ -14,22 +14,24 @@ def _shape(*shape: int) -> jax.ShapeDtypeStruct:
   return jax.ShapeDtypeStruct(shape, jnp.float32)
 
 
-def test_arrays_of_every_rank_go_through_a_scan():
+@pytest.mark.parametrize("device", ["cpu", "gpu"])
+def test_arrays_of_every_rank_go_through_a_scan(device, monkeypatch):
+  """Other devices than the CPU take another way, which works on a CPU too."""
+  monkeypatch.setattr(jax, "default_backend", lambda: device)
   seen = []
 
   def function(a, b, empty):
     seen.append((a.shape, b.shape, empty.shape))
     return [a + b, np.float32(a.sum()), empty]
 
-  host_call.register("test_every_rank", function)
+  name = f"test_every_rank_{device}"
+  host_call.register(name, function)
 
   @jax.jit
   def run(a, b):
     def body(a, _):
       shapes = (_shape(2, 3), _shape(), _shape(2, 0, 3))
-      moved, total, empty = host_call.call(
-        "test_every_rank", shapes, a, b, jnp.zeros((2, 0, 3))
-      )
+      moved, total, empty = host_call.call(name, shapes, a, b, jnp.zeros((2, 0, 3)))
       return moved, (total, empty)
 
     return jax.lax.scan(body, a, None, length=3)

@@ -25,8 +25,8 @@ _MAJOR, _MINOR = 0, 1
 
 _F32, _EXECUTE, _METADATA, _INTERNAL = 11, 3, 1, 13
 
-_registered: dict[str, Any] = {}
-"""Name -> what XLA has the address of; it must outlive every program."""
+_registered: dict[str, tuple[HostFunction, Any]] = {}
+"""Name -> function and what XLA has the address of; both must outlive every program."""
 
 
 def register(name: str, function: HostFunction) -> None:
@@ -59,12 +59,12 @@ def register(name: str, function: HostFunction) -> None:
       error = _ErrorArgs(ctypes.sizeof(_ErrorArgs), None, message, _INTERNAL)
       return frame.api.contents.create_error(ctypes.byref(error))
 
-  _registered[name] = _Handler(handler)
-  address = ctypes.cast(_registered[name], ctypes.c_void_p)
+  _registered[name] = function, _Handler(handler)
+  address = ctypes.cast(_registered[name][1], ctypes.c_void_p)
   jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(address), platform="cpu")
 
 
-def call(name: str, shapes: Any, *arrays: Any) -> Any:
+def call(name: str, shapes: Sequence[Any], *arrays: Any) -> Sequence[Any]:
   """Inside jit: what the function of this name makes of f32 ``arrays``.
 
   Args:
@@ -72,7 +72,12 @@ def call(name: str, shapes: Any, *arrays: Any) -> Any:
     shapes: ShapeDtypeStructs of what it returns.
     arrays: its arguments.
   """
-  return jax.ffi.ffi_call(name, shapes)(*arrays)
+  if jax.default_backend() == "cpu":
+    return jax.ffi.ffi_call(name, shapes)(*arrays)
+  # The arrays of a program on another device have to come over first.
+  function, _ = _registered[name]
+  host = lambda *arrays: tuple(function(*map(np.asarray, arrays)))  # noqa: E731
+  return jax.pure_callback(host, tuple(shapes), *arrays)
 
 
 def _array(buffer: Any) -> np.ndarray:
