@@ -61,7 +61,7 @@ def test_a_run_leaves_everything_behind(finished):
   assert [row["step"] for row in rows if "eval/success_rate" in row] == [32, 64]
   losses = [row["loss/q"] for row in rows if "loss/q" in row]
   assert np.isfinite(losses).all()
-  with folder.metrics_csv.open() as file:
+  with (run_dir / "metrics.csv").open() as file:
     assert len(list(csv.DictReader(file))) == len(rows)
   assert checkpoint.all_steps(run_dir) == [32, 64]
   assert iio.imread(folder.curve).shape[-1] in (3, 4)
