@@ -27,8 +27,8 @@ class SaveError(OSError):
 class CheckpointWriter:
   """Saves the checkpoints of one run and deletes those no longer wanted.
 
-  Use as a context manager: leaving it waits until the last save is on disk. A
-  checkpoint becomes visible only once it is complete.
+  Use as a context manager: leaving it waits until the last save is on disk, unless that
+  has failed. A checkpoint becomes visible only once it is complete.
   """
 
   def __init__(
@@ -38,7 +38,6 @@ class CheckpointWriter:
     *,
     keep: int,
     keep_best: bool = True,
-    resume_step: int | None = None,
   ):
     """Opens the run for writing.
 
@@ -47,8 +46,6 @@ class CheckpointWriter:
       config: stored beside every state.
       keep: newest checkpoints kept, with the older ones that their items lie in.
       keep_best: keep the one of highest success rate too (the newest of equals).
-      resume_step: the step the run goes on from; checkpoints of later steps belong
-        to a future that will now be another one, and are deleted.
     """
     import orbax.checkpoint as ocp
 
@@ -61,9 +58,6 @@ class CheckpointWriter:
       checkpoint_record.folder(run_dir), options=options
     )
     self._saving: tuple[int, float] | None = None
-    for step in self._manager.all_steps():
-      if resume_step is not None and step > resume_step:
-        self._manager.delete(step)
 
   @property
   def empty(self) -> bool:
@@ -144,8 +138,10 @@ class CheckpointWriter:
   def __enter__(self) -> CheckpointWriter:
     return self
 
-  def __exit__(self, *exception: object) -> None:
-    self.close()
+  def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
+    # Threads of a save that failed half-way can wait for each other for minutes.
+    if kind is None or not issubclass(kind, SaveError):
+      self.close()
 
   def _failed(self, error: Exception) -> SaveError:
     """Removes what a failed save left, which may be what fills the disk."""

@@ -72,7 +72,8 @@ def save(
     **demos._asdict(),
   }
   try:
-    np.savez_compressed(path, **arrays)
+    with path.open("wb") as file:  # Given a name, NumPy would append to it.
+      np.savez_compressed(file, **arrays)
   except OSError as error:
     raise ConfigError(f"cannot write {path}: {error}") from None
   episodes = int(demos.first.sum())
@@ -198,7 +199,8 @@ def record_expert(
 ) -> Demonstrations:
   """Episodes of the task's scripted expert, up to success or time-out.
 
-  They begin at rows of the bank that training sees.
+  They begin at rows of the bank that training sees. Those in which the world was not
+  finite are left out.
   """
   policy = expert_policy(env, noise=noise)
   row_key, key = jax.random.split(jax.random.key(seed))
@@ -210,14 +212,15 @@ def record_expert(
       policy_key, env_key = jax.random.split(key)
       action, _ = policy(state, policy_key)
       after = env.step(state, action, env_key)
-      return after, (state.physics, action, state.timestep.last)
+      return after, (state.physics, action, state.timestep.last, state.faults)
 
     keys = jax.random.split(key, env.config.episode_steps + 1)
     return jax.lax.scan(period, env.reset(rows), keys)[1]
 
-  state, action, last = jax.tree.map(np.asarray, play(rows, key))
-  length = last.argmax(0) + 1  # The first last instant; all episodes end in time.
-  inside = (np.arange(len(last))[:, None] < length).T  # [episodes, time]
+  state, action, last, faults = jax.tree.map(np.asarray, play(rows, key))
+  end = last.argmax(0)  # The first last instant; all sound episodes end in time.
+  sound = last.any(0) & (faults[end, np.arange(episodes)] == 0)
+  inside = (np.arange(len(last))[:, None] <= np.where(sound, end, -1)).T
   take = lambda x: np.moveaxis(x, 1, 0)[inside]  # noqa: E731 - a name for one index
   first = np.zeros_like(inside)
   first[:, 0] = True

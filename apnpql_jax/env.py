@@ -68,6 +68,8 @@ class Env:
     self._chain = arm.make_chain(scene)
     self._kinematics = make_kinematics(scene)
     self._cameras = _make_cameras(scene)
+    # Resets, steps and visits share one trace for each number of worlds.
+    self._arrive = jax.jit(self._judge_and_observe)
 
   @property
   def bank_split(self) -> int:
@@ -168,7 +170,7 @@ class Env:
     finite = [jnp.isfinite(x).all(tuple(range(1, x.ndim))) for x in seen]
     return jnp.stack(finite).all(0) & (moved.time > before.physics.time)
 
-  def _arrive(
+  def _judge_and_observe(
     self,
     state: PhysicsState,
     targets: Array,

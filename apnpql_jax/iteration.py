@@ -134,20 +134,27 @@ def initial_state(
   config: TrainConfig, env: Env, agent: Agent, expert: ExpertReplay
 ) -> TrainState:
   """The state before the first iteration; ``expert`` fills the expert's replay."""
-  key, *keys = jax.random.split(jax.random.key(config.seed), 5)
-  rows = jax.random.randint(keys[0], (config.env.worlds,), 0, env.bank_split)
-  worlds = jax.jit(env.reset)(rows)
-  slot = example_slot(worlds)
-  length = config.replay.capacity // config.env.worlds
-  return TrainState(
-    learner=jax.jit(agent.init)(keys[1], worlds.timestep.observation),
-    env=worlds,
-    replay=replay.create(slot, length, config.env.worlds),
-    expert_replay=expert(config, env, keys[2]),
-    key=key,
-    env_steps=jnp.zeros((), jnp.int32),
-    faults=Faults(in_a_row=jnp.zeros((), jnp.int32), key=keys[3]),
-  )
+
+  @jax.jit
+  def start(key: Array) -> tuple[TrainState, Array]:
+    key, *keys = jax.random.split(key, 5)
+    rows = jax.random.randint(keys[0], (config.env.worlds,), 0, env.bank_split)
+    worlds = env.reset(rows)
+    length = config.replay.capacity // config.env.worlds
+    return TrainState(
+      learner=agent.init(keys[1], worlds.timestep.observation),
+      env=worlds,
+      replay=replay.create(example_slot(worlds), length, config.env.worlds),
+      expert_replay=None,
+      key=key,
+      env_steps=jnp.zeros((), jnp.int32),
+      faults=Faults(in_a_row=jnp.zeros((), jnp.int32), key=keys[3]),
+    ), keys[2]
+
+  state, expert_key = start(jax.random.key(config.seed))
+  state = state.replace(expert_replay=expert(config, env, expert_key))
+  # Bound to the device, as a restored state is, so that both make the same program.
+  return jax.device_put(state, jax.devices()[0])
 
 
 def example_slot(worlds: EnvState) -> Slot:

@@ -9,7 +9,6 @@ so that no frame is stored twice and N can change without collecting again.
 from __future__ import annotations
 
 import functools
-import math
 from typing import Any
 
 from flax import struct
@@ -29,13 +28,6 @@ class Replay(struct.PyTreeNode):
   slots: Slot  # [length, worlds, ...]
   cursor: Array  # i32[]: time index written next; the oldest one once full
   size: Array  # i32[]: time steps held, at most length
-
-
-def nbytes(example_slot: Slot, length: int, worlds: int) -> int:
-  """Bytes that ``create`` with the same arguments takes; allocates nothing."""
-  leaves = jax.tree.leaves(example_slot)
-  per_slot = sum(math.prod(x.shape) * np.dtype(x.dtype).itemsize for x in leaves)
-  return length * worlds * per_slot + 2 * np.dtype(np.int32).itemsize
 
 
 def create(example_slot: Slot, length: int, worlds: int) -> Replay:
@@ -84,8 +76,8 @@ def add(replay: Replay, chunk: Slot) -> Replay:
 def exclude(replay: Replay, steps: Array) -> Replay:
   """Marks the newest ``steps`` (i32[worlds]) slots of each world as truncated.
 
-  No transition starts at a slot that is last, and none reaches beyond one, so that
-  an episode excluded from its first slot on is never drawn.
+  No transition starts at a slot that is last, and neither it nor its window reaches
+  beyond one, so that an episode excluded from its first slot on is never drawn.
   """
   length = replay.slots.action.shape[0]
   age = (replay.cursor - 1 - jnp.arange(length)) % length
@@ -121,8 +113,9 @@ def sample(
     batch_size: transitions B.
     n_step: N, at least 1.
     gamma: discount per control period.
-    windows: also return all N instants after the start, past an end of the episode
-      too; without it ``Transition.window`` is None.
+    windows: also return the N instants after the start; past an end of the episode
+      that end again, as what follows may be excluded. Without it
+      ``Transition.window`` is None.
 
   Returns:
     Transition [B, ...], weights zero where ``can_sample`` denies the ring and where
@@ -130,20 +123,22 @@ def sample(
   """
   time, world, valid = _draw_starts(replay, key, batch_size, n_step)
   length, timestep = replay.slots.action.shape[0], replay.slots.timestep
-  window = (time[:, None] + jnp.arange(1, n_step + 1)[None, :]) % length  # [B, N]
+  steps = jnp.arange(n_step)[None, :]
+  window = (time[:, None] + 1 + steps) % length  # [B, N]
   flags = (timestep.reward, timestep.terminated, timestep.truncated)
   reward, terminated, truncated = _gather(flags, window, world[:, None])
   # m - 1: position of the first end; the last column stands for "none within N".
   stop = jnp.argmax((terminated | truncated).at[:, -1].set(True), axis=1)
-  counted = jnp.arange(n_step)[None, :] <= stop[:, None]
+  counted = steps <= stop[:, None]
   powers = jnp.asarray(np.power(gamma, np.arange(n_step + 1)), reward.dtype)
   ended = jnp.take_along_axis(terminated, stop[:, None], axis=1)[:, 0]
+  window = (time[:, None] + 1 + jnp.minimum(steps, stop[:, None])) % length
   return Transition(
     observation_tm1=_gather(timestep.observation, time, world),
     action_tm1=_gather(replay.slots.action, time, world),
     reward_t=jnp.sum(jnp.where(counted, reward, 0.0) * powers[None, :-1], axis=1),
     discount_t=jnp.where(ended, 0.0, powers[stop + 1]),
-    observation_t=_gather(timestep.observation, (time + stop + 1) % length, world),
+    observation_t=_gather(timestep.observation, window[:, -1], world),
     primitives_tm1=_gather(timestep.primitives, time, world),
     weight=valid.astype(reward.dtype),
     window=_gather(replay.slots, window, world[:, None]) if windows else None,

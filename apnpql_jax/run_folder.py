@@ -40,11 +40,6 @@ class RunFolder:
     return self.path / "versions.json"
 
   @property
-  def metrics_csv(self) -> Path:
-    """Metrics as a table."""
-    return self.path / "metrics.csv"
-
-  @property
   def metrics_jsonl(self) -> Path:
     """Metrics, one JSON object per line."""
     return self.path / "metrics.jsonl"

@@ -5,17 +5,13 @@ Everything needed to go on is in ``TrainState``; nothing here is.
 
 from __future__ import annotations
 
-from collections.abc import Generator
-import contextlib
 import dataclasses
 import logging
 from pathlib import Path
-import signal
 import sys
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from apnpql_jax import (
   checkpoint,
@@ -24,7 +20,7 @@ from apnpql_jax import (
   faults,
   leaves,
   memory,
-  replay,
+  resuming,
   run_folder,
   runs,
 )
@@ -46,6 +42,7 @@ from apnpql_jax.progress import TrainProgress
 from apnpql_jax.reporter import Reporter
 from apnpql_jax.run_folder import RunFolder
 from apnpql_jax.runs import RunStopped
+from apnpql_jax.signals import Signals
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,16 +76,21 @@ def train(
     RunStopped: SIGINT or SIGTERM came, and the state is saved; or the run cannot go
       on, and its checkpoints are as they were.
   """
-  start = _start(config, run_dir, resume=resume, overwrite=overwrite)
-  _say(f"run folder {start.folder.path}; compiling, which takes a minute or two")
-  try:
-    state, evaluation, caught = _run(config, start)
-  except OSError as error:  # The disk is full or gone.
-    raise RunStopped(f"{error}; {_how_to_go_on(run_dir)}", runs.FAILED) from error
-  if caught and int(state.env_steps) < config.total_steps:
+  to_go_on = f"to go on: --resume {run_dir}"
+  with Signals(
+    "stopped before the first iteration was done; "
+    + (to_go_on if resume else "nothing is saved")
+  ) as signals:
+    start = _start(config, run_dir, resume=resume, overwrite=overwrite)
+    _say(f"run folder {start.folder.path}; compiling, which can take minutes")
+    try:
+      state, evaluation = _run(config, start, signals)
+    except OSError as error:  # The disk is full or gone.
+      raise RunStopped(f"{error}; {to_go_on}", runs.FAILED) from error
+  if signals.caught and int(state.env_steps) < config.total_steps:
     raise RunStopped(
-      f"saved at step {int(state.env_steps):,}; {_how_to_go_on(run_dir)}",
-      runs.INTERRUPTED + caught[0],
+      f"saved at step {int(state.env_steps):,}; {to_go_on}",
+      runs.INTERRUPTED + signals.caught[0],
     )
   return {
     "run": str(start.folder.path),
@@ -99,26 +101,25 @@ def train(
 
 
 def _run(
-  config: TrainConfig, start: Start
-) -> tuple[TrainState, dict[str, Any], list[int]]:
-  """Opens what is written to, and trains; the last evaluation and signals caught."""
+  config: TrainConfig, start: Start, signals: Signals
+) -> tuple[TrainState, dict[str, Any]]:
+  """Opens what is written to, and trains; returns the last evaluation too."""
   path, resume_step = start.folder.path, start.resume_step
+  if resume_step is not None and (aside := resuming.set_aside(path, resume_step)):
+    _say(f"later checkpoints, and the metrics until then, are now in {aside}")
   sinks = make_sinks(config.sinks, path, dict(codec.flatten(config)))
   with (
     MetricWriter(path, resume_step=resume_step, sinks=sinks) as writer,
-    CheckpointWriter(
-      path, config, keep=config.keep_checkpoints, resume_step=resume_step
-    ) as saver,
+    CheckpointWriter(path, config, keep=config.keep_checkpoints) as saver,
     TrainProgress(config.total_steps) as progress,
-    caught_signals() as caught,
   ):
     env, agent = start.env, start.agent
     reporter = Reporter(config, env, agent, start.folder, writer, progress)
     iteration = make_iteration(config, env, agent)
-    state = _loop(config, iteration, start.state, reporter, saver, caught)
+    state = _loop(config, iteration, start.state, reporter, saver, signals)
     if figures := saver.finished(wait=True):
       writer.write(int(state.env_steps), figures)
-  return state, reporter.evaluation, caught
+  return state, reporter.evaluation
 
 
 def _start(
@@ -139,7 +140,7 @@ def _start(
   example = jax.eval_shape(lambda: initial_state(config, env, agent, empty_expert))
   memory.check_memory(leaves.nbytes(example), "the training state")
   if saved:
-    state = _restore(config, run_dir, example)
+    state = resuming.restore(config, run_dir, example, _say)
     return Start(env, agent, folder, state, int(state.env_steps))
   state = initial_state(config, env, agent, _expert(config, env))
   if resume:
@@ -160,84 +161,27 @@ def _expert(config: TrainConfig, env: Env) -> ExpertReplay:
   return lambda config, env, _: demonstrations.make_replay(demos, config, env)
 
 
-def _loop(config, iteration, state, reporter, saver, caught) -> TrainState:
+def _loop(config, iteration, state, reporter, saver, signals) -> TrainState:
   """Iterates to the last step; evaluates and saves whenever a multiple is passed."""
   step = int(state.env_steps)
-  while step < config.total_steps and not caught:
+  while step < config.total_steps and not signals.caught:
     before = step
     state, metrics = iteration(state)
     step = int(state.env_steps)
     reporter.iteration(step, int(state.learner.step), metrics | saver.finished())
+    signals.finish_first(f"stopped at once; to go on: --resume {reporter.folder.path}")
     faults.check(config, state, reporter.folder)
     done = step >= config.total_steps
     rate = None
     # Who sends a signal may not wait for an evaluation before the state is safe.
-    if not caught and (done or _passed(before, step, config.eval_every)):
+    if not signals.caught and (done or _passed(before, step, config.eval_every)):
       rate = reporter.evaluate(step, state, last=done)
-    last = done or bool(caught)
+    last = done or bool(signals.caught)
     whole = _passed(before, step, config.save_replay_every or config.checkpoint_every)
     if last or whole or _passed(before, step, config.checkpoint_every):
-      items = _to_items(state, whole=last or whole or saver.empty)
+      items = resuming.to_items(state, whole=last or whole or saver.empty)
       saver.save(step, items, success_rate=rate)
   return state
-
-
-def _to_items(state: TrainState, *, whole: bool) -> dict[str, Any]:
-  """The parts of a checkpoint; the replay, by far the largest, only if ``whole``."""
-  rest = {name: getattr(state, name) for name in ("env", "key", "env_steps", "faults")}
-  items: dict[str, Any] = {"learner": state.learner, "rest": rest}
-  if whole:
-    items["replay"] = {"agent": state.replay, "expert": state.expert_replay}
-  return items
-
-
-def _restore(config: TrainConfig, run_dir: Path, example: TrainState) -> TrainState:
-  """The newest state that can be read; undoes ``_to_items``."""
-  found = checkpoint.restore(
-    run_dir, None, _to_items(example, whole=True), config=config
-  )
-  for line in found.damaged:
-    _say(line)
-  if found.damaged:
-    _say(f"going on from the checkpoint before, {found.step}")
-  ring = found.items["replay"]["agent"]
-  if found.steps["replay"] < found.step:
-    _say(f"its replay is that of step {found.steps['replay']:,}")
-    # What comes next does not follow on its newest slots.
-    ring = replay.exclude(ring, jnp.ones(config.env.worlds, jnp.int32))
-  return TrainState(
-    learner=found.items["learner"],
-    replay=ring,
-    expert_replay=found.items["replay"]["expert"],
-    **found.items["rest"],
-  )
-
-
-@contextlib.contextmanager
-def caught_signals() -> Generator[list[int]]:
-  """Collects SIGINT and SIGTERM instead of dying of them.
-
-  The iteration under way is finished and saved; a second signal acts as usual.
-  """
-  caught: list[int] = []
-  previous: dict[int, Any] = {}
-
-  def handler(number: int, _frame: Any) -> None:
-    caught.append(number)
-    for each, old in previous.items():
-      signal.signal(each, old)
-
-  for each in (signal.SIGINT, signal.SIGTERM):
-    previous[each] = signal.signal(each, handler)
-  try:
-    yield caught
-  finally:
-    for each, old in previous.items():
-      signal.signal(each, old)
-
-
-def _how_to_go_on(run_dir: Path) -> str:
-  return f"to go on: --resume {run_dir}"
 
 
 def _say(text: str) -> None:

@@ -1,165 +1,245 @@
-"""A run under fire: killed, stopped, damaged and starved of disk, again and again.
+"""A run under fire: killed, stopped, damaged, poisoned and starved, again and again.
 
-Trains a small run from state observations for as long as asked, does something to it
-every now and then, resumes it each time, and at last trains the same run undisturbed
-and compares the two, bit for bit. One JSON object per fault goes to standard output.
+  python benchmarks/soak.py --minutes 60      # two cores; any machine without a GPU
 
-  python benchmarks/soak.py --minutes 60 --run runs/soak
+Two runs of one seed train side by side. One is left alone, and its memory is measured;
+the other meets a fault every few seconds and is resumed. At the end both are brought to
+the same step, where all their arrays and metrics must be the same bits. Worlds and
+rewards that are not finite are put into checkpoints of copies of the disturbed run.
+Writes results/soak.json and results/soak.log beside this file.
 """
 
 from __future__ import annotations
 
 import argparse
+import collections
 from collections.abc import Callable
 import json
 import os
 from pathlib import Path
 import random
 import resource
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
+import threading
 import time
 from typing import Any
 
-import apnpql_jax  # noqa: F401  isort: skip  (before JAX: sets threads and cache)
-
-import jax
+import damage
 import numpy as np
-import orbax.checkpoint as ocp
+import tiny
 
-from apnpql_jax import checkpoint
+from apnpql_jax import checkpoint, runs
 
-SETTINGS = (
-  "--obs state --env.worlds 8 --env.bank-rows 256 --agent.hidden 32 32 "
-  "--agent.feature-dim 32 --agent.target-samples 16 --agent.policy-samples 16 "
-  "--replay.capacity 4096 --replay.expert-steps 512 --replay.expert-share 0.5 "
-  "--replay.batch-size 32 --rollout-length 4 --updates-per-iteration 4 --no-video "
-  "--eval-every 1000000000 --eval-episodes 4 --checkpoint-every 512"
-).split()
-FOR_EVER = "2000000000"
+RESULTS = Path(__file__).resolve().parent / "results"
+INTERVAL = 512
+"""Environment steps between two checkpoints."""
+
+OPTIONS = (
+  f"--replay.capacity 4096 --replay.expert-steps 512 --checkpoint-every {INTERVAL}"
+)
+FOR_EVER = ["--total-steps", "2000000000"]
+PATIENCE_S = 600
+Process = subprocess.Popen[bytes]
 
 
-def start(run: Path, total: str, *, file_limit: int | None = None) -> subprocess.Popen:
-  """Trains, or goes on; a file beyond ``file_limit`` bytes meets a full disk."""
-  command = [sys.executable, "-m", "apnpql_jax", "train", "--total-steps", total]
-  if (run / "config.json").exists():
-    command += ["--resume", str(run)]
-  else:
-    command += ["push_plate", "--run", str(run), *SETTINGS]
-  limit = resource.RLIM_INFINITY if file_limit is None else file_limit
-  with run.with_suffix(".log").open("ab") as log:
-    return subprocess.Popen(
-      command,
-      stdout=log,
-      stderr=log,
-      preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
-    )
+class Trial:
+  """A run in a folder of its own, and what one may do to it."""
+
+  def __init__(self, folder: Path, rng: random.Random):
+    folder.mkdir()
+    self.run, self._rng = folder / "run", rng
+    self._said = folder / "said"
+
+  def start(self, run: Path, *args: str) -> Process:
+    """A process that trains; its output replaces that of the one before."""
+    self._said.write_text("")
+    return tiny.start(run, *OPTIONS.split(), *(args or FOR_EVER), said=self._said)
+
+  def disturb(self, fault: str) -> dict[str, Any]:
+    """Trains for some seconds, does something, and tells what came of it."""
+    run, target = self.run, self.run
+    before = checkpoint.latest_step(run) or 0
+    if fault.startswith("poisoned"):
+      target = run.with_name("poisoned")
+      shutil.copytree(run, target)
+      damage.poison(target, rewards=fault.endswith("rewards"))
+    process = self.start(target)
+    self.wait(process)
+    code = self._end(process, fault)
+    row = {"fault": fault, "exit": code, "from": before, "to": reached(target)}
+    if target is run:
+      row["lost"] = row["to"] - (checkpoint.latest_step(run) or 0)
+      if fault == "bit flip" and len(checkpoint.all_steps(run)) > 1:
+        row["file"] = damage.flip_a_bit(run, self._rng)
+    else:
+      faults = [r for r in tiny.rows(target) if r["step"] > before]
+      for name in ("faults/worlds", "faults/updates"):
+        row[name] = sum(r.get(name) or 0 for r in faults)
+      if dumps := list(target.glob("faults/*.npz")):
+        row["repeated"] = _repeat(dumps[0])
+      shutil.rmtree(target)
+    return row
+
+  def _end(self, process: Process, fault: str) -> int:
+    pause = self._rng.uniform(0.0, 8.0)
+    if fault == "kill in a save":
+      self._until(lambda: any((self.run / "checkpoints").glob("*tmp*")), process)
+      process.kill()
+    elif fault == "disk full":
+      time.sleep(pause)
+      resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (16 << 10, 16 << 10))
+    elif fault != "poisoned rewards":  # That stops by itself.
+      time.sleep(pause)
+      polite = {"SIGINT": signal.SIGINT, "SIGTERM": signal.SIGTERM}
+      polite["poisoned world"] = signal.SIGTERM
+      process.send_signal(polite.get(fault, signal.SIGKILL))
+    return process.wait(PATIENCE_S)
+
+  def wait(self, process: Process) -> None:
+    """Until the process just started has done an iteration, or has ended."""
+    self._until(lambda: "%)" in self._said.read_text(errors="replace"), process)
+
+  def _until(self, happens: Callable[[], bool], process: Process) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not happens() and process.poll() is None:
+      if time.monotonic() > deadline:
+        raise TimeoutError(self._said.read_text()[-2000:])
+      time.sleep(0.005)
+
+
+EXPECTED = {
+  "kill": -signal.SIGKILL,
+  "SIGTERM": 128 + signal.SIGTERM,
+  "poisoned world": 128 + signal.SIGTERM,
+  "poisoned rewards": runs.FAILED,
+  "kill in a save": -signal.SIGKILL,
+  "disk full": runs.FAILED,
+  "bit flip": -signal.SIGKILL,
+  "SIGINT": 128 + signal.SIGINT,
+}
+"""Fault -> exit code that it must have."""
+
+
+def as_expected(row: dict[str, Any]) -> bool:
+  """Whether a fault did what ``docs/reliability.md`` says, and no more."""
+  fault = row["fault"]
+  if fault == "poisoned world" and row["faults/worlds"] != 1:
+    return False
+  if fault == "poisoned rewards" and "batch" not in row["repeated"]:
+    return False
+  # What is trained while a checkpoint is being written is lost with it.
+  return row["exit"] == EXPECTED[fault] and row.get("lost", 0) <= 2 * INTERVAL
 
 
 def reached(run: Path) -> int:
   """Environment steps of the last whole row of the metrics."""
-  path = run / "metrics.jsonl"
-  lines = path.read_text().splitlines(keepends=True) if path.exists() else []
-  whole = [line for line in lines if line.endswith("\n")]
-  return json.loads(whole[-1])["step"] if whole else 0
+  rows = tiny.rows(run)
+  return rows[-1]["step"] if rows else 0
 
 
-def resident_mib(process: subprocess.Popen) -> float:
-  """Memory of a process that is still there."""
-  status = Path(f"/proc/{process.pid}/status").read_text()
-  fields = dict(line.split(":", 1) for line in status.splitlines())
-  return int(fields.get("VmRSS", "0 kB").split()[0]) / 1024
+class Memory:
+  """Resident memory of a process, once a second, until it ends."""
+
+  def __init__(self, process: Process):
+    self.samples: list[tuple[float, float]] = []  # s, MiB
+    self._process = process
+    self._thread = threading.Thread(target=self._watch)
+    self._thread.start()
+
+  def _watch(self) -> None:
+    began = time.monotonic()
+    while self._process.poll() is None:
+      pages = int(Path(f"/proc/{self._process.pid}/statm").read_text().split()[1])
+      mib = pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+      self.samples.append((time.monotonic() - began, mib))
+      time.sleep(1.0)
+
+  def summary(self) -> dict[str, Any]:
+    """MiB once a minute, and their slope after the first fifth of the time."""
+    self._thread.join()
+    seconds, mib = np.array(self.samples[:-1]).T
+    late = seconds > 0.2 * seconds[-1]
+    slope = np.polyfit(seconds[late] / 3600, mib[late], 1)[0]
+    minutes = [round(float(x)) for x in mib[::60]]
+    return {"minutes_mib": minutes, "slope_mib_per_h": round(float(slope), 1)}
 
 
-def train_a_while(process: subprocess.Popen, run: Path, seconds: float) -> list[float]:
-  """Waits for the first new row, then ``seconds``; memory once a second meanwhile."""
-  metrics, memory = run / "metrics.jsonl", []
-  begun = metrics.stat().st_mtime if metrics.exists() else 0.0
-  until = None
-  while process.poll() is None and (until is None or time.monotonic() < until):
-    moved = metrics.exists() and metrics.stat().st_mtime > begun
-    if until is None and moved and reached(run) > (checkpoint.latest_step(run) or 0):
-      until = time.monotonic() + seconds
-    if until is not None:
-      memory.append(resident_mib(process))
-    time.sleep(1.0)
-  return memory
-
-
-def flip_a_bit(run: Path, rng: random.Random) -> str:
-  """In the replay of the newest checkpoint; returns the file."""
-  folder = run / "checkpoints" / str(checkpoint.latest_step(run)) / "replay"
-  files = [p for p in folder.rglob("*") if p.is_file() and p.stat().st_size]
-  file = max(files, key=lambda p: p.stat().st_size)
-  data = bytearray(file.read_bytes())
-  data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
-  file.write_bytes(data)
-  return str(file.relative_to(run))
-
-
-def disturb(run: Path, fault: str, rng: random.Random) -> dict[str, Any]:
-  """One stretch of training and what ends it."""
-  before = checkpoint.latest_step(run) or 0
-  limit = None
-  if fault == "disk full":  # Some rows fit, a checkpoint does not.
-    limit = (run / "metrics.jsonl").stat().st_size + (32 << 10)
-  process = start(run, FOR_EVER, file_limit=limit)
-  memory = train_a_while(process, run, rng.uniform(5, 60))
-  stop: dict[str, Callable[[], None]] = {
-    "SIGTERM": process.terminate,
-    "SIGINT": lambda: process.send_signal(signal.SIGINT),
-  }
-  stop.get(fault, process.kill)()
-  code = process.wait(600)
-  step, saved = reached(run), checkpoint.latest_step(run) or 0
-  row = {"fault": fault, "exit": code, "from": before, "to": step, "saved": saved}
-  row["lost"] = step - saved
-  if fault == "bit flip" and len(checkpoint.all_steps(run)) > 1:
-    row["file"] = flip_a_bit(run, rng)
-  if memory:
-    row["mib"] = [round(memory[0]), round(memory[-1])]
-  return row
-
-
-def same_bits(a: Path, b: Path, step: int) -> bool:
-  """Whether two runs have the same arrays at a step, read by Orbax alone."""
-
-  def arrays(run: Path) -> list[bytes]:
-    folders = [
-      run / "checkpoints" / str(step) / i for i in ("learner", "rest", "replay")
-    ]
-    with ocp.StandardCheckpointer() as reader:
-      trees = [reader.restore(folder.absolute()) for folder in folders]
-    return [np.asarray(x).tobytes() for x in jax.tree.leaves(trees)]
-
-  return arrays(a) == arrays(b)
+def losses(run: Path) -> list[tuple[int, float]]:
+  """Step and loss of every iteration in the metrics, in their order."""
+  return [(row["step"], row["loss/q"]) for row in tiny.rows(run) if "loss/q" in row]
 
 
 def main() -> int:
-  """Runs the soak; 0 if nothing was lost beyond what is promised."""
+  """Runs the soak; 0 if everything came as promised."""
   parser = argparse.ArgumentParser(description=__doc__)
   parser.add_argument("--minutes", type=float, default=60.0)
-  parser.add_argument("--run", type=Path, required=True)
   parser.add_argument("--seed", type=int, default=0)
   args = parser.parse_args()
-  rng, run = random.Random(args.seed), args.run.absolute()
-  os.makedirs(run.parent, exist_ok=True)
-  began = time.monotonic()
-  faults = ["SIGKILL", "SIGTERM", "SIGKILL", "bit flip", "SIGINT", "disk full"]
-  count = 0
-  while time.monotonic() - began < 60 * args.minutes:
-    row = disturb(run, faults[count % len(faults)], rng)
-    minutes = (time.monotonic() - began) / 60
-    print(json.dumps({"minutes": round(minutes, 1), **row}), flush=True)
-    count += 1
-  total = reached(run) + 512
-  total -= total % 32
-  straight = run.with_name(run.name + "-straight")
-  codes = [start(folder, str(total)).wait() for folder in (run, straight)]
-  same = codes == [0, 0] and same_bits(run, straight, total)
-  print(json.dumps({"faults": count, "env_steps": total, "same_bits": same}))
-  return 0 if same else 1
+  with tempfile.TemporaryDirectory() as name:
+    result, events = soak(Path(name), args.minutes, random.Random(args.seed))
+  RESULTS.joinpath("soak.json").write_text(json.dumps(result, indent=2) + "\n")
+  lines = [json.dumps(event) + "\n" for event in events]
+  RESULTS.joinpath("soak.log").write_text("".join(lines))
+  print(json.dumps(result))
+  return 0 if result["as_promised"] else 1
+
+
+def soak(
+  folder: Path, minutes: float, rng: random.Random
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+  """Both runs to their end: a summary, and what happened in its order."""
+  alone, disturbed = (Trial(folder / name, rng) for name in ("alone", "disturbed"))
+  trials, events = (alone, disturbed), []
+  straight = alone.start(alone.run)
+  alone.wait(straight)  # What it compiles, the other takes from the cache.
+  memory, began = Memory(straight), time.monotonic()
+  try:
+    while (passed := (time.monotonic() - began) / 60) < minutes:
+      event = disturbed.disturb(list(EXPECTED)[len(events) % len(EXPECTED)])
+      event = {"minute": round(passed, 1), "as_promised": as_expected(event)} | event
+      events.append(event)
+      print(json.dumps(event), flush=True)
+  finally:
+    straight.terminate()
+  stopped = straight.wait(PATIENCE_S) == EXPECTED["SIGTERM"]
+  total = max(reached(trial.run) for trial in trials) + tiny.STEPS
+  codes = [
+    trial.start(trial.run, "--total-steps", str(total)).wait(PATIENCE_S * 6)
+    for trial in trials
+  ]
+  bits = (
+    [tiny.saved_bytes(trial.run, total) for trial in trials] if codes == [0, 0] else []
+  )
+  figures = losses(alone.run)
+  whole = [step for step, _ in figures] == list(
+    range(tiny.STEPS, total + 1, tiny.STEPS)
+  )
+  result = {
+    "minutes": round((time.monotonic() - began) / 60, 1),
+    "cores": len(os.sched_getaffinity(0)),
+    "env_steps": total,
+    "faults": collections.Counter(event["fault"] for event in events),
+    "most_steps_lost": max((event.get("lost", 0) for event in events), default=0),
+    "checkpoint_every": INTERVAL,
+    "memory": memory.summary(),
+    "same_bits": bool(bits) and bits[0] == bits[1],
+    "metrics_consistent": whole and figures == losses(disturbed.run),
+  }
+  kept = stopped and result["same_bits"] and result["metrics_consistent"]
+  kept = kept and all(event["as_promised"] for event in events)
+  return result | {"as_promised": kept}, events
+
+
+def _repeat(dump: Path) -> str:
+  """What ``apnpql repeat`` says of a dumped update."""
+  command = [sys.executable, "-m", "apnpql_jax", "repeat", str(dump)]
+  env = os.environ | {"PYTHONPATH": str(tiny.ROOT)}
+  done = subprocess.run(command, cwd=dump.parent, env=env, capture_output=True)
+  return done.stdout.decode()
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import tiny
 
 from apnpql_jax import validation
 from apnpql_jax.agents import algorithms
@@ -28,11 +29,6 @@ CONFIG = AgentConfig(
   n_step=2,
 )
 BATCH = 6
-QUICK = {
-  "xla_backend_optimization_level": 0,
-  "xla_llvm_disable_expensive_passes": True,
-}
-"""Compiler options: what runs once need not run fast."""
 VALUE = {"loss/q": {"encoder", "z"}, "loss/ap": {"encoder", "ap"}}
 ALPHA = {"loss/alpha": {"alpha"}}
 PRIOR = {"loss/m": {"bp"}, "loss/nu": {"nu"}}
@@ -68,7 +64,9 @@ def losses_and_slopes(config: AgentConfig):
     return parts, (total, metrics)
 
   with jax.numpy_rank_promotion("raise"):
-    slope = jax.jit(jax.jacrev(losses, has_aux=True), compiler_options=QUICK)
+    slope = jax.jit(
+      jax.jacrev(losses, has_aux=True), compiler_options=tiny.FAST_COMPILE
+    )
     slopes, (total, metrics) = slope(trained)
   return total, metrics, slopes
 
@@ -133,7 +131,7 @@ def test_no_batch_makes_a_number_that_is_none(name: str):
   def body(state, key):
     return agent.update(state, adversarial(batch, key), key)
 
-  @functools.partial(jax.jit, compiler_options=QUICK)
+  @functools.partial(jax.jit, compiler_options=tiny.FAST_COMPILE)
   def run(state):
     state, metrics = jax.lax.scan(body, state, jax.random.split(jax.random.key(1), 100))
     action, info = agent.act(

@@ -18,6 +18,7 @@ from apnpql_jax import demonstrations, recordings
 from apnpql_jax.config import ConfigError
 from apnpql_jax.demonstrations import Demonstrations
 from apnpql_jax.env import Env, make_env
+from apnpql_jax.sim.physics import START_TIME, Physics, PhysicsState
 
 ENV = dataclasses.replace(tiny.CONFIG.env, time_limit_s=0.9)
 CONFIG = dataclasses.replace(tiny.CONFIG, env=ENV)
@@ -31,6 +32,10 @@ def env() -> Env:
 
 @pytest.fixture(scope="module")
 def demos(env) -> Demonstrations:
+  return _record(env)
+
+
+def _record(env: Env) -> Demonstrations:
   return demonstrations.record_expert(env, episodes=EPISODES, seed=0, noise=0.1)
 
 
@@ -85,6 +90,40 @@ def test_the_replay_is_what_the_worlds_showed(demos, env):
     if t < STEPS:
       action = jnp.asarray(demos.action[begin + t])
       state = step(state, action, jax.random.key(t))
+
+
+def test_the_name_is_the_one_asked_for(tmp_path, demos, env):
+  for name in ("demos", "demos.v1", "demos.npz"):
+    told = demonstrations.save(
+      tmp_path / name, demos, task="push_plate", control_period_s=0.15
+    )
+    assert told["file"] == str(tmp_path / name)
+    assert demonstrations.load(Path(told["file"]), env).instants == demos.instants
+  assert len(list(tmp_path.iterdir())) == 3
+
+
+class Breaking:
+  """The engine of the worlds, in which world 2 breaks in its third period."""
+
+  def __init__(self, engine: Physics):
+    self._engine, self.name, self.scene = engine, engine.name, engine.scene
+
+  def step(self, state: PhysicsState, velocity: Any, close: Any) -> PhysicsState:
+    moved = self._engine.step(state, velocity, close)
+    late = moved.time[2] > START_TIME + 2.5 * 0.15
+    return moved.replace(
+      qvel=moved.qvel.at[2, 0].set(jnp.where(late, jnp.nan, moved.qvel[2, 0]))
+    )
+
+
+def test_an_episode_that_was_not_finite_is_left_out(demos, env):
+  broken = Env(env.config, env.task, env._bank)
+  broken.physics = Breaking(env.physics)
+  rest = _record(broken)
+  kept = np.cumsum(demos.first) != 3
+  assert rest.first.sum() == EPISODES - 1
+  for a, b in zip(rest, demos, strict=True):
+    np.testing.assert_allclose(a, b[kept], atol=1e-5)
 
 
 WRONG = {

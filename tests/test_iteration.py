@@ -17,7 +17,16 @@ import numpy as np
 import pytest
 import tiny
 
-from apnpql_jax import checkpoint, cli, faults, leaves, replay, run_folder, runs, train
+from apnpql_jax import (
+  checkpoint,
+  cli,
+  faults,
+  leaves,
+  replay,
+  resuming,
+  run_folder,
+  runs,
+)
 from apnpql_jax.agents.algorithms import ALGORITHMS
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.checkpoint_writer import CheckpointWriter
@@ -63,6 +72,7 @@ def built(request) -> Built:
   )
   env, agent = make_env(config.env), make_agent(config.agent)
   state = initial_state(config, env, agent, collect_expert)
+  assert all(x.committed for x in jax.tree.leaves(state))
   jitted: Any = make_iteration(config, env, agent)
   iteration = jitted.lower(state).compile(compiler_options=tiny.FAST_COMPILE)
   for _ in range(3):
@@ -148,14 +158,16 @@ def test_an_iteration_is_a_function_of_its_state(iteration, state):
 def _save(run: Path, built: Built, *states: tuple[TrainState, bool]) -> None:
   with CheckpointWriter(run, built.config, keep=9) as writer:
     for state, whole in states:
-      writer.save(int(state.env_steps), train._to_items(state, whole=whole))
+      writer.save(int(state.env_steps), resuming.to_items(state, whole=whole))
 
 
 def test_a_state_that_was_saved_goes_on_bit_by_bit(built, iteration, tmp_path):
   _save(tmp_path, built, (built.state, True))
   example = jax.eval_shape(lambda: jax.tree.map(jnp.copy, built.state))
-  restored = train._restore(built.config, tmp_path, example)
+  restored = resuming.restore(built.config, tmp_path, example, pytest.fail)
   straight = built.state
+  # Otherwise the first resume would compile the iteration again.
+  assert all(x.committed for x in jax.tree.leaves(restored))
   assert _bits(restored) == _bits(straight) and len(_bits(straight)) > 60
   for _ in range(2):
     straight, told = iteration(straight)
@@ -164,14 +176,15 @@ def test_a_state_that_was_saved_goes_on_bit_by_bit(built, iteration, tmp_path):
 
 
 def test_without_its_replay_a_state_goes_on_with_an_older_one(
-  built, iteration, tmp_path, capsys
+  built, iteration, tmp_path
 ):
   before, after = built.state, iteration(built.state)[0]
   _save(tmp_path, built, (before, True), (after, False))
   assert checkpoint.all_steps(tmp_path) == [24, 32]
   example = jax.eval_shape(lambda: jax.tree.map(jnp.copy, after))
-  restored = train._restore(built.config, tmp_path, example)
-  assert "its replay is that of step 24" in capsys.readouterr().err
+  said: list[str] = []
+  restored = resuming.restore(built.config, tmp_path, example, said.append)
+  assert said == ["its replay is that of step 24"]
   assert _bits(restored.replace(replay=None)) == _bits(after.replace(replay=None))
   assert int(restored.replay.cursor) == int(before.replay.cursor)
   # What is added next does not follow on the newest instant, which is now an end.

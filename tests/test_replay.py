@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from apnpql_jax import memory, replay as rb
+from apnpql_jax import leaves, memory, replay as rb
 from apnpql_jax.config import ConfigError
 from apnpql_jax.types import Observation, Slot, TimeStep, Transition
 
@@ -153,6 +153,15 @@ def test_no_transition_leaves_its_episode(n_step: int):
   assert t.min() >= 16 and t_next.max() <= 47
 
 
+def _until_end(step: TimeStep, t: int, w: int, n_step: int) -> list[int]:
+  """Slots 1 to N after t; from the first end on only that."""
+  slots = []
+  for _ in range(n_step):
+    t += not slots or not (step.terminated[t, w] or step.truncated[t, w])
+    slots.append(t)
+  return slots
+
+
 def test_windows_are_the_slots_after_the_start_across_the_seam():
   stream = _stream(48, WORLDS, 0.2, seed=4)
   replay = _fill(stream, length=32, chunk=16)  # Newest and oldest slot are neighbours.
@@ -160,13 +169,35 @@ def test_windows_are_the_slots_after_the_start_across_the_seam():
   draw = functools.partial(draw, batch_size=64, n_step=4, gamma=GAMMA)
   batch = jax.device_get(draw(windows=True))
   t, w = batch.observation_tm1.robot.astype(int).T
-  after = t[:, None] + np.arange(1, 5)
+  after = np.array(
+    [_until_end(stream.timestep, *start, 4) for start in zip(t, w, strict=True)]
+  )
   expected = jax.tree.map(lambda x: x[after, w[:, None]], stream)
   jax.tree.map(np.testing.assert_array_equal, batch.window, expected)
   # Nothing else is drawn otherwise.
   without = jax.device_get(draw())
   assert without.window is None
   jax.tree.map(np.testing.assert_array_equal, without, batch.replace(window=None))
+
+
+def test_neither_transition_nor_window_reaches_an_excluded_episode():
+  """One world: an episode of six slots, then one that breaks and is not numbers."""
+  stream = _stream(12, 1, 0.0, seed=0)
+  end, broken = np.arange(12)[:, None] == 5, np.arange(12) > 5
+  step = dataclasses.replace(stream.timestep, truncated=end)
+  stream = dataclasses.replace(stream, timestep=step)
+  for leaf in (step.observation.robot, step.reward, stream.action, stream.log_prob):
+    leaf[broken] = np.nan
+  ring = rb.exclude(_fill(stream, length=12, chunk=4), jnp.array([6]))
+  batch = jax.device_get(
+    rb.sample(
+      ring, jax.random.key(0), batch_size=64, n_step=4, gamma=GAMMA, windows=True
+    )
+  )
+  drawn = batch.weight > 0
+  assert set(batch.observation_tm1.robot[drawn, 0]) == set(range(5))
+  for leaf in jax.tree.leaves(batch):
+    assert np.isfinite(leaf[drawn]).all()
 
 
 def test_rewards_worked_by_hand():
@@ -237,8 +268,9 @@ def test_dtypes_and_bytes_are_those_of_the_slots():
   batch = _sample(replay, jax.random.key(0), 4, 3)
   assert _image(batch.observation_t).dtype == jnp.uint8
   assert _image(batch.observation_t).shape == (4, 2, 3, 3)
+  slot = 2 * 3 * 3 + 4 * (2 + 1 + 21 + 7 + 1) + 2
   held = sum(leaf.nbytes for leaf in jax.tree.leaves(replay))
-  assert rb.nbytes(_example(), 8, WORLDS) == held
+  assert held == 8 * WORLDS * slot + 8
 
 
 def test_one_key_gives_one_batch():
@@ -296,7 +328,7 @@ def test_an_iteration_of_add_and_samples_copies_no_ring():
   # Compiled only, never run: the ring is not allocated. A copy shows as temporaries.
   length, example = 1024, _example(pixels=3000)
   replay = jax.eval_shape(lambda: rb.create(example, length, WORLDS))
-  ring_bytes = rb.nbytes(example, length, WORLDS)
+  ring_bytes = leaves.nbytes(replay)
   chunk = jax.tree.map(
     lambda x: jax.ShapeDtypeStruct((4, *x.shape[1:]), x.dtype), replay.slots
   )
@@ -331,7 +363,8 @@ def test_add_writes_into_the_donated_buffer():
 
 
 def test_a_ring_larger_than_memory_is_refused_in_one_line():
-  needed = rb.nbytes(_example(pixels=72 * 96), 10**7, 1000)
+  ring = jax.eval_shape(lambda: rb.create(_example(pixels=72 * 96), 10**7, 1000))
+  needed = leaves.nbytes(ring)
   with pytest.raises(ConfigError, match=r"replay needs .* GiB .*replay.capacity") as e:
     memory.check_memory(needed, "the agent replay")
   assert "\n" not in str(e.value)

@@ -18,13 +18,14 @@ import tiny
 from apnpql_jax import checkpoint
 
 PATIENCE_S = 900
+FOR_EVER = ("--total-steps", "100000")
 
 
-def _wait_for_progress(process: subprocess.Popen[bytes], said: Path) -> None:
-  """Until a run just started has done an iteration, and says so."""
-  before, deadline = said.read_text().count("%)"), time.monotonic() + PATIENCE_S
-  while said.read_text().count("%)") == before:
-    assert process.poll() is None and time.monotonic() < deadline
+def _wait(process: subprocess.Popen[bytes], said: Path, word: str = "%)") -> None:
+  """Until a process just started says ``word``, or that an iteration is done."""
+  before, deadline = said.read_text().count(word), time.monotonic() + PATIENCE_S
+  while said.read_text().count(word) == before:
+    assert process.poll() is None and time.monotonic() < deadline, said.read_text()
     time.sleep(0.02)
 
 
@@ -37,23 +38,38 @@ def _finish(process: subprocess.Popen[bytes], said: Path) -> None:
 )
 def test_a_run_killed_at_random_moments_ends_as_if_nothing_had_been(tmp_path, kills):
   rng, said, run = np.random.default_rng(kills), tmp_path / "said", tmp_path / "run"
+  demos, same = tmp_path / "demos.npz", tmp_path / "same.npz"
+  for path in (demos, same):
+    tiny.write_demonstrations(path)
+
+  # While the iteration is being compiled there is nothing to wait for.
+  process = tiny.start(run, *FOR_EVER, "--replay.demonstrations", str(demos), said=said)
+  _wait(process, said, "compiling")
+  process.send_signal(signal.SIGINT)
+  assert process.wait(5) == 128 + signal.SIGINT
+  *_, told, last = said.read_text().splitlines()
+  assert "compiling" in told and last.startswith("apnpql: stopped before the first")
+  assert f"16 instants of {demos} for 32 slots" in said.read_text()
+
   lost, saving = [], 0
   for _ in range(kills):
-    process = tiny.start(run, "--total-steps", "100000", said=said)
-    _wait_for_progress(process, said)
-    time.sleep(rng.uniform(0.0, 5.0))
+    process = tiny.start(run, *FOR_EVER, said=said)
+    _wait(process, said)
+    time.sleep(rng.uniform(0.0, 3.0))
     process.kill()
     process.wait()
-    reached = tiny.rows(run)[-1]["step"]
-    lost.append(reached - (checkpoint.latest_step(run) or 0))
+    reached, saved = tiny.rows(run)[-1]["step"], checkpoint.latest_step(run) or 0
+    lost.append(reached - saved)
     saving += any((run / "checkpoints").glob("*tmp*"))
     print(f"lost {lost[-1]} of {reached}", flush=True)
+    if saved:  # From the first checkpoint on nobody needs the file.
+      demos.unlink(missing_ok=True)
   # An interval, and what is trained while a checkpoint is being written.
   assert max(lost) <= 2 * tiny.CONFIG.checkpoint_every
   print(f"{kills} kills, {saving} while saving; environment steps lost: {lost}")
 
-  process = tiny.start(run, "--total-steps", "100000", said=said)
-  _wait_for_progress(process, said)
+  process = tiny.start(run, *FOR_EVER, said=said)
+  _wait(process, said)
   process.terminate()
   assert process.wait(PATIENCE_S) == 128 + signal.SIGTERM
   stopped = checkpoint.latest_step(run)
@@ -62,6 +78,7 @@ def test_a_run_killed_at_random_moments_ends_as_if_nothing_had_been(tmp_path, ki
   # Evaluations are none of the training's business.
   total = str(tiny.rows(run)[-1]["step"] + 16 * tiny.STEPS)
   other = ["--total-steps", total, "--eval-episodes", "2"]
+  other += ["--replay.demonstrations", str(same)]
   straight, log = tmp_path / "straight", tmp_path / "log"
   together = [
     tiny.start(run, "--total-steps", total, said=said),
@@ -77,7 +94,9 @@ def test_a_run_killed_at_random_moments_ends_as_if_nothing_had_been(tmp_path, ki
     for folder in (run, straight)
   ]
   assert losses[0] == losses[1] and len(losses[0]) == int(total) // tiny.STEPS
-  # After the first iteration nothing was compiled but the evaluation.
+  # What the processes before compiled is not compiled again, and after the first
+  # iteration nothing is but the evaluation.
   compiled = log.read_text().partition(" 8 of ")[2].count("Finished XLA compilation")
   assert log.read_text().count("compilation of jit(iteration)") == 1
+  assert "compilation cache hit for 'jit_iteration'" in log.read_text()
   assert 0 < compiled < 8 < len(losses[1])

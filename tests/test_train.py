@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
-import os
 from pathlib import Path
 import signal
 import subprocess
@@ -25,7 +24,7 @@ from apnpql_jax.config import (
   TrainConfig,
 )
 from apnpql_jax.evaluate import evaluate_run
-from apnpql_jax.train import caught_signals, train
+from apnpql_jax.train import train
 
 CONFIG = TrainConfig(
   env=EnvConfig(worlds=4, bank_rows=256, time_limit_s=1.5, backend="native"),
@@ -62,7 +61,7 @@ def test_a_run_leaves_everything_behind(finished):
   assert [row["step"] for row in rows if "eval/success_rate" in row] == [32, 64]
   losses = [row["loss/q"] for row in rows if "loss/q" in row]
   assert np.isfinite(losses).all()
-  with folder.metrics_csv.open() as file:
+  with (run_dir / "metrics.csv").open() as file:
     assert len(list(csv.DictReader(file))) == len(rows)
   assert checkpoint.all_steps(run_dir) == [32, 64]
   assert iio.imread(folder.curve).shape[-1] in (3, 4)
@@ -126,13 +125,3 @@ def test_ctrl_c_ends_the_run_with_a_checkpoint(tmp_path):
   rows = [json.loads(line) for line in metrics.read_text().splitlines()]
   assert rows[-1]["step"] == step
   assert f"saved at step {step}; to go on: --resume {run_dir}" in said.read_text()
-
-
-def test_signals_are_collected_once_and_given_back():
-  before = signal.getsignal(signal.SIGTERM)
-  with caught_signals() as caught:
-    os.kill(os.getpid(), signal.SIGTERM)
-    assert caught == [signal.SIGTERM]
-    # A second one would act as usual.
-    assert signal.getsignal(signal.SIGTERM) == before
-  assert signal.getsignal(signal.SIGTERM) == before

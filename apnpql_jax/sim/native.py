@@ -1,7 +1,7 @@
 """C MuJoCo engine: a batch of worlds on threads, reached from inside jit.
 
 On a bare CPU it is ten to a hundred times faster than MJX on contact-rich
-scenes. The host callback touches NumPy only: calling JAX from it can deadlock.
+scenes. Compiled code calls it by name, see ``host_call``.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import mujoco
 from mujoco import batch as mujoco_batch
 import numpy as np
 
-from apnpql_jax.sim import physics
+from apnpql_jax.sim import host_call, physics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
@@ -49,28 +49,33 @@ class NativePhysics:
     self._torque_limit = scene.model.actuator_ctrlrange[:6, 1].copy()
     self._mass_index = _mass_index(scene.model, scene.arm_dof)
     self._lock = threading.Lock()
+    self._fields = (*_STATE_FIELDS, *sorted(scene.variants))
+    self._call = f"apnpql_native_{scene.fingerprint}_{substeps}"
+    host_call.register(self._call, self._step_host)
 
   def step(self, state: PhysicsState, velocity: Array, close: Array) -> PhysicsState:
     """See ``physics.Physics.step``."""
-    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)
-    return jax.pure_callback(self._step_host, shapes, state, velocity, close)
+    arrays = {name: getattr(state, name) for name in _STATE_FIELDS} | state.fields
+    ordered = [arrays[name] for name in self._fields]
+    shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in ordered]
+    moved = host_call.call(
+      self._call, shapes[: len(_STATE_FIELDS)], *ordered, velocity, close
+    )
+    return state.replace(**dict(zip(_STATE_FIELDS, moved, strict=True)))
 
   @functools.lru_cache(maxsize=4)  # noqa: B019 - lives as long as the engine
   def _batch(self, worlds: int) -> mujoco_batch.Batch:
     return mujoco_batch.Batch(self.scene.model, nsim=worlds, persistent=True)
 
-  def _step_host(self, state, velocity, close):
+  def _step_host(self, *arrays: np.ndarray) -> list[np.ndarray]:
+    *state, velocity, close = arrays
     with self._lock:
-      batch = self._batch(velocity.shape[0])
-      for name in _STATE_FIELDS:
-        getattr(batch, name)[...] = np.asarray(getattr(state, name))
-      for name, value in state.fields.items():
-        batch.expand(name)[...] = np.asarray(value)
-      self._advance(batch, np.asarray(velocity), np.asarray(close))
-      fields = {
-        name: np.asarray(getattr(batch, name), np.float32) for name in _STATE_FIELDS
-      }
-    return state.replace(**fields)
+      batch = self._batch(len(velocity))
+      for name, value in zip(self._fields, state, strict=True):
+        held = getattr(batch, name) if name in _STATE_FIELDS else batch.expand(name)
+        held[...] = value
+      self._advance(batch, velocity, close)
+      return [np.array(getattr(batch, name), np.float32) for name in _STATE_FIELDS]
 
   def _advance(self, batch, velocity, close) -> None:
     scene, arm = self.scene, self.scene.arm_dof

@@ -1,7 +1,6 @@
-"""The smallest runs that are still real, shared by the tests of reliability.
+"""The smallest runs that are still real, for the tests of reliability and the soak.
 
-Their processes compile without optimisation: the native engine's callbacks keep XLA
-from caching what it compiled, and nobody waits for such a run to be fast.
+Their processes compile without optimisation: nobody waits for such a run to be fast.
 """
 
 from __future__ import annotations
@@ -17,7 +16,10 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
+from apnpql_jax import demonstrations
 from apnpql_jax.config import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
+from apnpql_jax.primitives.bank import load_bank
+from apnpql_jax.tasks import make_task
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -75,6 +77,25 @@ def start(
     return subprocess.Popen(
       [*command, *args], cwd=said.parent, env=env, stdout=file, stderr=file
     )
+
+
+def write_demonstrations(path: Path) -> None:
+  """A file of four episodes of four instants, in which the arm holds still."""
+  env = CONFIG.env
+  task = make_task(env.task)
+  bank, _ = load_bank(task, env.bank_rows)
+  rows = np.arange(16) // 4
+  still = demonstrations.Demonstrations(
+    qpos=np.asarray(bank.qpos)[rows],
+    qvel=np.zeros((16, task.scene.model.nv), np.float32),
+    mocap_pos=np.asarray(bank.mocap_pos)[rows],
+    mocap_quat=np.asarray(bank.mocap_quat)[rows],
+    variant=np.asarray(bank.variant)[rows],
+    action=np.zeros((16, 7), np.float32),
+    first=np.arange(16) % 4 == 0,
+  )
+  period_s = env.control_period_s
+  demonstrations.save(path, still, task=env.task, control_period_s=period_s)
 
 
 def rows(run_dir: Path) -> list[dict[str, Any]]:

@@ -1,0 +1,201 @@
+"""What each command of ``apnpql`` does with its options; returns what is to be shown.
+
+JAX, MuJoCo and everything built on them are imported inside the functions, so that
+help and refusals of bad input are instant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from apnpql_jax import presets, runs
+from apnpql_jax.config import (
+  BACKENDS,
+  ConfigError,
+  EnvConfig,
+  TrainConfig,
+  check_name,
+  validate,
+)
+from apnpql_jax.options import Collect, Convert, Evaluate, List, Repeat, Train, parse
+
+Json = dict[str, Any]
+
+
+def train(args: Train, argv: Sequence[str]) -> Json:
+  """Validates everything, then trains or goes on training; returns its summary."""
+  if args.resume is not None and (args.run is not None or args.overwrite):
+    raise ConfigError("--resume names the run itself; leave out --run and --overwrite")
+  if not args.preset and args.resume is None:
+    names = ", ".join(presets.preset_names())
+    raise ConfigError(f"train needs a preset; choose from {names}")
+  if args.preset:
+    base = presets.load_preset(args.preset)
+  else:
+    base = runs.load_run_config(args.resume or Path())
+  # Parsed a second time, now on top of the settings asked for.
+  args = parse(Train, "train", argv, default=Train(config=base))
+  config = _with_shortcuts(args)
+  run_dir = args.resume or args.run or runs.new_run_dir(args.preset)
+  if args.resume is None:
+    runs.check_free(run_dir, overwrite=args.overwrite)
+  validate(config)
+  if args.resume is not None:
+    runs.check_resumable(args.resume, config)
+  _check_registered(config)
+
+  from apnpql_jax.train import train as run_training
+
+  return run_training(
+    config, run_dir, resume=args.resume is not None, overwrite=args.overwrite
+  )
+
+
+def evaluate(args: Evaluate, argv: Sequence[str]) -> Json:
+  """Plays held-out episodes with a checkpoint of a run."""
+  del argv
+  if not args.run:
+    raise ConfigError("evaluate needs a run folder: apnpql evaluate RUN")
+  _check_episodes(args.episodes, args.seed)
+  if args.backend is not None:
+    check_name("backend", args.backend, BACKENDS)
+  runs.load_run_config(Path(args.run))
+
+  from apnpql_jax.evaluate import evaluate_run
+
+  return evaluate_run(
+    Path(args.run),
+    episodes=args.episodes,
+    seed=args.seed,
+    backend=args.backend,
+    step=_checkpoint_step(args),
+  )
+
+
+def collect(args: Collect, argv: Sequence[str]) -> Json:
+  """Plays episodes with the scripted expert of a task."""
+  del argv
+  _check_episodes(args.episodes, args.seed)
+  check_name("backend", args.backend, BACKENDS)
+  if not 0.0 <= args.noise < float("inf"):
+    raise ConfigError(f"--noise {args.noise} must be a number of at least 0, in rad/s")
+
+  from apnpql_jax import tasks
+
+  check_name("task", args.task, tasks.task_names())
+  env = EnvConfig(task=args.task)
+  if args.task in presets.preset_names():
+    env = presets.load_preset(args.task).env
+
+  from apnpql_jax.evaluate import evaluate_expert
+
+  # The expert acts on privileged poses: drawing images would only cost time.
+  env = dataclasses.replace(env, task=args.task, backend=args.backend, obs="state")
+  settings = {"episodes": args.episodes, "seed": args.seed, "noise": args.noise}
+  figures = evaluate_expert(env, **settings)
+  if args.save is None:
+    return figures
+  from apnpql_jax import demonstrations
+
+  return figures | demonstrations.save_expert(args.save, env, **settings)
+
+
+def convert(args: Convert, argv: Sequence[str]) -> Json:
+  """Makes demonstrations of recorded joint trajectories."""
+  del argv
+  if not args.out:
+    raise ConfigError(
+      "convert needs three names: apnpql convert RECORDING.npz TASK OUT.npz"
+    )
+  from apnpql_jax import demonstrations, recordings, tasks
+
+  check_name("task", args.task, tasks.task_names())
+  period_s = EnvConfig().control_period_s
+  if args.task in presets.preset_names():
+    period_s = presets.load_preset(args.task).env.control_period_s
+  scene = tasks.make_task(args.task).scene
+  demos = recordings.convert(Path(args.recording), scene, period_s=period_s)
+  return demonstrations.save(
+    Path(args.out), demos, task=args.task, control_period_s=period_s
+  )
+
+
+def repeat(args: Repeat, argv: Sequence[str]) -> Json:
+  """Names what was not finite in an update that a run stopped for."""
+  del argv
+  if not args.file:
+    raise ConfigError("repeat needs a file: apnpql repeat RUN/faults/step_<n>.npz")
+  path = Path(args.file).absolute()
+  runs.load_run_config(path.absolute().parent.parent)
+
+  from apnpql_jax import faults
+
+  return faults.repeat(path)
+
+
+def list_names(args: List, argv: Sequence[str]) -> Json:
+  """The names that other commands accept, or what the contacts of each task cost."""
+  del argv
+  from apnpql_jax import tasks
+  from apnpql_jax.agents import algorithms
+
+  names = tasks.task_names()
+  if args.contacts:
+    from apnpql_jax.contact_report import contact_report
+
+    return {name: contact_report(tasks.make_task(name)) for name in names}
+  return {
+    "tasks": names,
+    "presets": presets.preset_names(),
+    "algorithms": list(algorithms.ALGORITHMS),
+    "backends": list(BACKENDS),
+  }
+
+
+def _check_registered(config: TrainConfig) -> None:
+  """Checks what needs the simulator, the learner or the device to be known."""
+  from apnpql_jax import memory, tasks
+  from apnpql_jax.agents import algorithms
+
+  validate(
+    config,
+    tasks=tasks.task_names(),
+    algorithms=algorithms.epsilon_is_bounded(),
+    memory_bytes=memory.available_memory(),
+  )
+
+
+def _checkpoint_step(args: Evaluate) -> int | None:
+  """Steps of the checkpoint asked for; None for the newest."""
+  if args.checkpoint == "newest":
+    return None
+  if args.checkpoint == "best":
+    from apnpql_jax.checkpoint import best_step
+
+    return best_step(Path(args.run))
+  if args.checkpoint.isdigit():
+    return int(args.checkpoint)
+  raise ConfigError(
+    f"unknown --checkpoint {args.checkpoint!r}; choose from newest, best, or its steps"
+  )
+
+
+def _check_episodes(episodes: int, seed: int) -> None:
+  if episodes < 1:
+    raise ConfigError(f"--episodes {episodes} must be at least 1")
+  if not 0 <= seed < 2**31:
+    raise ConfigError(f"--seed {seed} must be within 0 and 2**31 - 1")
+
+
+def _with_shortcuts(args: Train) -> TrainConfig:
+  config = args.config
+  env = {"backend": args.backend, "obs": args.obs}
+  env = {name: value for name, value in env.items() if value is not None}
+  config = dataclasses.replace(config, env=dataclasses.replace(config.env, **env))
+  if args.algorithm is None:
+    return config
+  agent = dataclasses.replace(config.agent, algorithm=args.algorithm)
+  return dataclasses.replace(config, agent=agent)
