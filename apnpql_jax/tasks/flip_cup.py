@@ -288,7 +288,7 @@ def _direction(vector: Array) -> Array:
 
 
 def _hand(reach: Array, roll: Array) -> Array:
-  """Rotation of a tool along ``reach``, turned by ``roll`` from a closing plane upright.
+  """Rotation of a tool along ``reach``, turned by ``roll`` from an upright plane.
 
   f32[worlds, 3], f32[worlds] -> f32[worlds, 3, 3].
   """

@@ -17,8 +17,8 @@ REST_TURN = 0.5
 """rad/s."""
 
 POINTER = 0.2
-"""m; a direction is observed as a vector of this length, so that a turn by a few degrees
-weighs as much as a few centimetres."""
+"""m; a direction is observed as a vector of this length, so that a turn by a few
+degrees weighs as much as a few centimetres."""
 
 
 def norm(x: Array) -> Array:
