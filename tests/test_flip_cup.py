@@ -194,6 +194,6 @@ def test_objects_are_the_poses_and_the_shape(task, resets):
   cup = np.asarray(resets.qpos[:, address : address + 3])
   shapes = np.array(flip_cup.SHAPES)[np.arange(WORLDS) % 3]
   np.testing.assert_allclose(objects[:, :3], cup)
-  np.testing.assert_allclose(objects[:, 3:6], cup - [0, 0, 0.05], atol=1e-6)
+  np.testing.assert_allclose(objects[:, 3:6], 0 * cup - [0, 0, 0.2], atol=1e-6)
   np.testing.assert_allclose(objects[:, 6:9], resets.mocap_pos[:, 0])
   np.testing.assert_allclose(objects[:, 9:], shapes[:, 1:] / [1, 2], atol=1e-6)
