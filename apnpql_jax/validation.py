@@ -77,7 +77,8 @@ def validate(
   if algorithms is not None:
     check_name("agent.algorithm", config.agent.algorithm, tuple(algorithms))
   _validate_agent(config.agent)
-  if algorithms is not None and algorithms[config.agent.algorithm]:
+  limited = config.agent.temperature != "fixed"
+  if limited and algorithms is not None and algorithms[config.agent.algorithm]:
     _validate_epsilon(config.agent)
   _validate_replay(config, memory_bytes)
 

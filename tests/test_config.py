@@ -128,6 +128,21 @@ def test_epsilon_is_bounded_only_where_candidates_are_weighed(epsilon, weighed):
   validate(changed("agent.epsilon", epsilon), algorithms={"ap_npql": weighed})
 
 
+def test_a_fixed_temperature_keeps_no_limit():
+  agent = dataclasses.replace(AgentConfig(), epsilon=9.0, temperature="fixed")
+  validate(TrainConfig(agent=agent), algorithms={"ap_npql": True})
+
+
+def test_defaults_of_the_learner_are_the_constants_of_the_paper():
+  """Section V-B, and the 51 bins of Sec. III-C."""
+  agent = AgentConfig()
+  assert (agent.gamma, agent.target_rate) == (0.99, 0.05)
+  assert (agent.learning_rate_e, agent.learning_rate_m) == (3e-4, 3e-4)
+  assert (agent.learning_rate_alpha, agent.learning_rate_nu) == (1e-4, 1e-4)
+  assert (agent.target_samples, agent.policy_samples) == (120, 100)
+  assert (agent.hidden, agent.num_atoms) == ((256, 256), 51)
+
+
 def test_replay_that_holds_no_transition_is_refused():
   config = TrainConfig(replay=ReplayConfig(capacity=128), rollout_length=1)
   with pytest.raises(ConfigError, match="use at least 160"):
