@@ -8,35 +8,29 @@ state is no longer finite starts again in the same way, and is counted.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import functools
 
 from flax import struct
 import jax
 import jax.numpy as jnp
 
+from apnpql_jax.cameras import Renderer, make_cameras
 from apnpql_jax.config import ConfigError, EnvConfig
 from apnpql_jax.primitives import tracking
 from apnpql_jax.primitives.bank import ResetBank, load_bank
-from apnpql_jax.render import CameraSpec, Geoms, Lighting, render
+from apnpql_jax.randomization import make_randomize
 from apnpql_jax.sim import arm, physics
-from apnpql_jax.sim.kinematics import Kinematics, make_kinematics
+from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.tasks import Task, make_task
 from apnpql_jax.types import Array, Observation, TimeStep
-
-GLOBAL_SIZE = (72, 96)
-WRIST_SIZE = (36, 64)
-"""Height and width in pixels (paper Sec. V-A)."""
 
 HISTORY = 3
 """Robot states stacked (paper Sec. V-A)."""
 
 HELD_OUT_SHARE = 0.25
 """Share of the bank's rows that only evaluation sees."""
-
-Renderer = Callable[[Kinematics], Array]
 
 
 class EnvState(struct.PyTreeNode):
@@ -67,9 +61,12 @@ class Env:
     self._bank = bank
     self._chain = arm.make_chain(scene)
     self._kinematics = make_kinematics(scene)
-    self._cameras = _make_cameras(scene)
+    self._cameras = make_cameras(config, scene)
     # Resets, steps and visits share one trace for each number of worlds.
     self._arrive = jax.jit(self._judge_and_observe)
+    self._randomize = None
+    if config.randomize:
+      self._randomize = make_randomize(config.randomization, scene)
 
   @property
   def bank_split(self) -> int:
@@ -82,14 +79,15 @@ class Env:
     return self._bank.rows - self.bank_split
 
   def reset(self, rows: Array) -> EnvState:
-    """Starts one world per bank row.
+    """Starts one world per bank row; a row always has the same randomisation.
 
     Args:
       rows: i32[worlds].
     """
     count = rows.shape[0]
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), rows)
     return self._arrive(
-      self._initial(rows),
+      self._initial(rows, keys),
       self._bank.targets[rows],
       elapsed=jnp.zeros(count, jnp.int32),
       fresh=jnp.ones(count, bool),
@@ -109,7 +107,9 @@ class Env:
     broken = ~state.timestep.last & ~self._sound(state, action, moved)
     reset = state.timestep.last | broken
     rows = jax.random.randint(key, reset.shape, 0, self.bank_split)
-    merged = jax.tree.map(functools.partial(_where, reset), self._initial(rows), moved)
+    keys = jax.random.split(jax.random.fold_in(key, 1), len(rows))
+    initial = self._initial(rows, keys)
+    merged = jax.tree.map(functools.partial(_where, reset), initial, moved)
     arrived = self.visit(state, merged, self._bank.targets[rows], reset)
     return arrived.replace(faults=state.faults + broken)
 
@@ -150,15 +150,25 @@ class Env:
     """u8[worlds, H, W, 3]: another look at the worlds, for videos."""
     return renderer(self._kinematics(state))
 
-  def _initial(self, rows: Array) -> PhysicsState:
+  def randomized(self, state: PhysicsState, keys: Array) -> PhysicsState:
+    """States at rest in worlds of their own, if the configuration asks for that.
+
+    Args:
+      state: [worlds, ...].
+      keys: [worlds], typed PRNG keys.
+    """
+    return state if self._randomize is None else self._randomize(state, keys)
+
+  def _initial(self, rows: Array, keys: Array) -> PhysicsState:
     bank = self._bank
-    return physics.initial_state(
+    state = physics.initial_state(
       self.task.scene,
       bank.qpos[rows],
       bank.mocap_pos[rows],
       bank.mocap_quat[rows],
       bank.variant[rows],
     )
+    return self.randomized(state, keys)
 
   def _sound(self, before: EnvState, action: Array, moved: PhysicsState) -> Array:
     """bool[worlds]: everything is finite, and the engine has not started over.
@@ -185,7 +195,8 @@ class Env:
     *pose, close = self.task.tool_targets(state, kinematics)
     q = state.qpos[:, self.task.scene.arm_qpos]
     present = jnp.broadcast_to(q[:, None], targets.shape)
-    targets = tracking.refine(self._chain, targets, present, *pose)
+    chain = arm.with_base(self._chain, self.task.scene, state.fields)
+    targets = tracking.refine(chain, targets, present, *pose)
     solved = self.task.success(state, kinematics) & ~fresh
     late = (elapsed >= self.config.episode_steps) & ~fresh
     timestep = TimeStep(
@@ -205,6 +216,9 @@ class Env:
     stacked = jnp.concatenate([history[:, 7:], joints], axis=-1)
     robot = _where(fresh, jnp.tile(joints, (1, HISTORY)), stacked)
     tool = kinematics.site_xpos[:, scene.tool_site]
+    if "body_pos" in state.fields or "body_quat" in state.fields:
+      # What the robot reports: it does not know how the table stands.
+      tool, _, _ = arm.forward(self._chain, state.qpos[:, scene.arm_qpos])
     seen = Observation(robot=robot, tool=tool)
     if self.config.obs == "state":
       return seen.replace(objects=self.task.objects(state))
@@ -220,7 +234,9 @@ def make_env(config: EnvConfig) -> Env:
       control period that is not made of whole steps, or no resets within reach.
   """
   task = make_task(config.task)
-  _make_cameras(task.scene)  # Refuses what cannot be drawn before the bank is built.
+  make_cameras(
+    config, task.scene
+  )  # Refuses what cannot be drawn before the bank is built.
   bank, _ = load_bank(task, config.bank_rows)
   return Env(config, task, bank)
 
@@ -235,37 +251,6 @@ def _substeps(config: EnvConfig, scene: Scene) -> int:
       f"scene's timestep, {timestep} s"
     )
   return substeps
-
-
-def _make_cameras(scene: Scene) -> tuple[Renderer, Renderer]:
-  return (
-    camera_renderer(scene, "global", GLOBAL_SIZE),
-    camera_renderer(scene, "wrist", WRIST_SIZE),
-  )
-
-
-def camera_renderer(scene: Scene, name: str, size: tuple[int, int]) -> Renderer:
-  """Returns ``f(kinematics) -> u8[worlds, H, W, 3]`` for a camera of the scene."""
-  index = scene.id("camera", name)
-  height, width = size
-  spec = CameraSpec.from_model(scene.model, name, height=height, width=width)
-  geoms = Geoms.from_model(scene.model)
-  lighting = Lighting.from_model(scene.model)
-
-  def renderer(kinematics: Kinematics) -> Array:
-    return render(
-      geoms,
-      spec,
-      kinematics.geom_xpos,
-      kinematics.geom_xmat,
-      kinematics.cam_xpos[:, index],
-      kinematics.cam_xmat[:, index],
-      lighting,
-      geom_size=kinematics.geom_size,
-      outputs=("rgb",),
-    ).rgb
-
-  return renderer
 
 
 def _where(condition: Array, yes: Array, no: Array) -> Array:

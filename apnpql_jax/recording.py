@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax.env import GLOBAL_SIZE, WRIST_SIZE, Env, EnvState, camera_renderer
+from apnpql_jax.cameras import camera_renderer
+from apnpql_jax.env import Env, EnvState
 from apnpql_jax.render.video import GREEN, RED, add_border, tile, write_video
 from apnpql_jax.rollout import Policy
 from apnpql_jax.types import Array
@@ -47,11 +48,12 @@ def film(env: Env, policy: Policy) -> list[np.ndarray]:
   states, running, solved = jax.jit(lambda key: _play(env, policy, rows, key))(
     jax.random.key(0)
   )
-  cameras = (
-    camera_renderer(env.task.scene, "global", VIEW_SIZE),
-    camera_renderer(env.task.scene, "global", GLOBAL_SIZE),
-    camera_renderer(env.task.scene, "wrist", WRIST_SIZE),
+  sizes = (
+    ("global", VIEW_SIZE),
+    ("global", env.config.global_size),
+    ("wrist", env.config.wrist_size),
   )
+  cameras = [camera_renderer(env.config, env.task.scene, *size) for size in sizes]
   draw = jax.jit(lambda physics: [env.view(camera, physics) for camera in cameras])
   episodes = []
   for episode in range(EPISODES):

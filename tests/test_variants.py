@@ -89,7 +89,7 @@ def test_each_world_is_seen_in_its_own_shape(task, models, state):
     kinematics.geom_xmat,
     kinematics.cam_xpos[:, camera],
     kinematics.cam_xmat[:, camera],
-    geom_size=kinematics.geom_size,
+    fields=kinematics.fields,
     outputs=("segmentation",),
   )
   for world in range(WORLDS):

@@ -161,6 +161,9 @@ class Lighting:
   shadow: float = 0.4
   """Share of the intensity that a shadow takes away."""
 
+  id: int = 0
+  """MuJoCo id of the light, for where it differs between worlds."""
+
   def __post_init__(self):
     shares = (self.ambient, self.diffuse, self.fill, self.shadow, *self.background)
     if any(not 0.0 <= x <= 1.0 for x in shares) or self.ambient + self.diffuse > 1.0:
@@ -189,7 +192,7 @@ class Lighting:
     if len(lights) != 1 or model.light_bodyid[lights[0]] != 0:
       raise ConfigError("the scene needs exactly one directional light, in the world")
     x, y, z = model.light_dir[lights[0]].tolist()
-    return cls(direction=(x, y, z), **settings)
+    return cls(direction=(x, y, z), id=int(lights[0]), **settings)
 
 
 def _effective_rgba(model: mujoco.MjModel) -> np.ndarray:

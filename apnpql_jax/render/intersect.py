@@ -30,10 +30,10 @@ _NUDGE = 1e-7  # rad; turns a ray off a cylinder's axis, where its equation is 0
 class Rays(NamedTuple):
   """Directions (u, v, -1) of the P pixels of an image, in the camera's frame."""
 
-  u: np.ndarray  # f32[P]
-  v: np.ndarray  # f32[P]
-  norm2: np.ndarray  # f32[P]: squared length of the direction
-  inv_norm2: np.ndarray  # f32[P]
+  u: np.ndarray | Array  # f32[P]
+  v: np.ndarray | Array  # f32[P]
+  norm2: np.ndarray | Array  # f32[P]: squared length of the direction
+  inv_norm2: np.ndarray | Array  # f32[P]
 
 
 class Frames(NamedTuple):
@@ -59,6 +59,13 @@ def make_rays(height: int, width: int, fovy_deg: float) -> Rays:
   u, v = (a.reshape(-1) for a in np.meshgrid(x, y))
   norm2 = u * u + v * v + 1.0
   return Rays(*(a.astype(np.float32) for a in (u, v, norm2, 1.0 / norm2)))
+
+
+def zoomed(rays: Rays, zoom: Array) -> Rays:
+  """The same pixels of a camera whose image is ``zoom`` times as wide at unit depth."""
+  u, v = rays.u * zoom, rays.v * zoom
+  norm2 = u * u + v * v + 1.0
+  return Rays(u, v, norm2, 1.0 / norm2)
 
 
 def along(w: Array, rays: Rays) -> Array:

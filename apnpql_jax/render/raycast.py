@@ -11,7 +11,7 @@ XLA fuses the fold into what uses it and casts the scene again for each colour c
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import functools
 
 from flax import struct
@@ -19,8 +19,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax.render import intersect, shadow
+from apnpql_jax.render import intersect, shadow, texture
 from apnpql_jax.render.geoms import CameraSpec, Geoms, Lighting
+from apnpql_jax.render.look import FIELDS, Look, make_look
 
 Array = jax.Array
 
@@ -54,7 +55,7 @@ def render(
   cam_xmat: Array,
   lighting: Lighting = DEFAULT_LIGHTING,
   *,
-  geom_size: Array | None = None,
+  fields: Mapping[str, Array] | None = None,
   outputs: Sequence[str] = OUTPUTS,
   near: float = NEAR,
 ) -> Image:
@@ -71,7 +72,7 @@ def render(
     cam_xpos: f32[*b, 3], world position of this camera.
     cam_xmat: f32[*b, 3, 3], world rotation of this camera.
     lighting: light, background, shadows.
-    geom_size: f32[*b, ngeom, 3], MuJoCo half sizes in m; those of ``geoms`` if None.
+    fields: what differs between worlds, as in ``look.FIELDS``, with leading axes *b.
     outputs: which of "rgb", "depth", "segmentation" to compute; only these are paid.
     near: smallest depth drawn, in metres.
 
@@ -91,11 +92,13 @@ def render(
     if pose.shape != (*batch, *tail) or tail[-1] != 3:
       raise ValueError(f"poses do not fit together: {[p.shape for p in poses]}")
   one = functools.partial(_render_one, geoms, camera, lighting, tuple(outputs), near)
+  fields = {k: v for k, v in (fields or {}).items() if k in FIELDS}
   if not batch:
-    return one(*poses, geom_size)
-  flat = [p.reshape(-1, *t) for p, t in zip(poses, tails, strict=True)]
-  sizes = None if geom_size is None else geom_size.reshape(-1, *geom_size.shape[-2:])
-  image = jax.vmap(one)(*flat, sizes)
+    return one(*poses, fields)
+  flat, fields = jax.tree.map(
+    lambda x: x.reshape(-1, *x.shape[len(batch) :]), (poses, fields)
+  )
+  image = jax.vmap(one)(*flat, fields)
   return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), image)
 
 
@@ -109,41 +112,45 @@ def _render_one(
   geom_xmat: Array,
   cam_xpos: Array,
   cam_xmat: Array,
-  geom_size: Array | None,
+  fields: Mapping[str, Array],
 ) -> Image:
   """One image; arguments as of ``render``, without leading axes."""
   to_camera = cam_xmat[None, :, :]
   center = ((geom_xpos[geoms.ids] - cam_xpos[None])[:, :, None] * to_camera).sum(axis=1)
   axes = (to_camera[..., None] * geom_xmat[geoms.ids][:, :, None, :]).sum(axis=1)
-  basis = jnp.asarray(shadow.light_basis(lighting.direction))
-  basis = (basis[:, :, None] * to_camera).sum(axis=1)
-  sizes = geoms.sizes if geom_size is None else geom_size[geoms.ids]
-  frames = intersect.prepare(center, axes, sizes, basis[2])
+  look = make_look(geoms, camera, lighting, fields)
+  basis = (look.light[:, :, None] * to_camera).sum(axis=1)
+  frames = intersect.prepare(center, axes, look.sizes, basis[2])
 
-  blocks = _blocks(camera)
-  cast = functools.partial(_cast, geoms, lighting, frames, basis, near)
+  blocks = _blocks(camera, look.zoom)
+  cast = functools.partial(_cast, geoms, lighting, look, frames, basis, near)
   t = paint = None
   # A loop each: with two results XLA would not keep the fold in one piece.
-  if "depth" in outputs:
+  textured = look.waves is not None and "rgb" in outputs
+  if "depth" in outputs or textured:
     t = jax.lax.map(lambda rays: cast(rays)[0], blocks)
   if "rgb" in outputs or "segmentation" in outputs:
     paint = jax.lax.map(lambda rays: cast(rays)[1], blocks)
-  return _develop(geoms, camera, lighting, outputs, t, paint)
+  if textured:
+    draw = functools.partial(texture.textured, frames, look.waves, look.grain)
+    paint = jax.lax.map(lambda seen: draw(*seen), (blocks, t, paint))
+  return _develop(geoms, camera, look.palette, outputs, t, paint)
 
 
-def _blocks(camera: CameraSpec) -> intersect.Rays:
+def _blocks(camera: CameraSpec, zoom: Array | None) -> intersect.Rays:
   """The rays of an image, f32[BLOCKS, P / BLOCKS]; the last block may be padded."""
   rays = intersect.make_rays(camera.height, camera.width, camera.fovy_deg)
   padding = -rays.u.size % BLOCKS
-  return jax.tree.map(
+  rays = jax.tree.map(
     lambda x: jnp.asarray(np.pad(x, (0, padding), "edge").reshape(BLOCKS, -1)), rays
   )
+  return rays if zoom is None else intersect.zoomed(rays, zoom)
 
 
 def _develop(
   geoms: Geoms,
   camera: CameraSpec,
-  lighting: Lighting,
+  palette: Array | np.ndarray,
   outputs: tuple[str, ...],
   t: Array | None,
   paint: Array | None,
@@ -152,35 +159,27 @@ def _develop(
   shape = (camera.height, camera.width)
   pixels = camera.height * camera.width
   depth = rgb = segmentation = None
-  if t is not None:
+  if "depth" in outputs:
     t = t.reshape(-1)[:pixels]
     depth = jnp.where(t < intersect.MISS, t, jnp.inf).reshape(shape)
   if paint is not None:
     paint = paint.reshape(-1)[:pixels]
-    colors, ids = _palette(geoms, lighting)
     index = jnp.floor(paint)
     entry = index.astype(jnp.int32)
     if "rgb" in outputs:
+      colors = palette * np.float32(256.0)
       rgb = jnp.take(colors, entry, axis=0, mode="clip") * (paint - index)[:, None]
       rgb = rgb.astype(jnp.uint8).reshape(*shape, 3)
     if "segmentation" in outputs:
+      ids = np.concatenate([geoms.ids, geoms.ids, np.array([-1], np.int32)])
       segmentation = jnp.take(ids, entry, mode="clip").reshape(shape)
   return Image(rgb=rgb, depth=depth, segmentation=segmentation)
-
-
-def _palette(geoms: Geoms, lighting: Lighting) -> tuple[np.ndarray, np.ndarray]:
-  """Colours and geom ids by paint index: geoms, odd squares of checkers, background."""
-  colors = [geoms.colors, geoms.checker_colors, np.array([lighting.background])]
-  ids = [geoms.ids, geoms.ids, np.array([-1])]
-  return (
-    np.concatenate(colors).astype(np.float32) * np.float32(256.0),
-    np.concatenate(ids).astype(np.int32),
-  )
 
 
 def _cast(
   geoms: Geoms,
   lighting: Lighting,
+  look: Look,
   frames: intersect.Frames,
   basis: Array,
   near: float,
@@ -199,36 +198,29 @@ def _cast(
     geom = intersect.row(frames, k)
     t_k, cosine = intersect.HITS[kind](geom, rays, ray_light)
     index = float(k)
-    if geoms.checker[k] > 0.0:
+    if look.waves is None and geoms.checker[k] > 0.0:
       edge = float(geoms.checker[k])
-      index = index + len(geoms.ids) * _odd_square(geom, rays, t_k, edge)
+      x, y = intersect.plane_point(geom, rays, t_k)
+      index = index + len(geoms.ids) * texture.odd_square(x / edge, y / edge)
     closer = (t_k < t) & (t_k > near)
     t = jnp.where(closer, t_k, t)
-    paint = jnp.where(closer, index + _intensity(lighting, cosine), paint)
+    paint = jnp.where(closer, index + _intensity(lighting, look, cosine), paint)
   if lighting.shadow_casters:
-    paint = _darken(geoms, lighting, frames, basis, rays, t, paint)
+    paint = _darken(geoms, lighting, look, frames, basis, rays, t, paint)
   return t, paint
 
 
-def _intensity(lighting: Lighting, cosine: Array) -> Array:
+def _intensity(lighting: Lighting, look: Look, cosine: Array) -> Array:
   """In [0, 255/256]; ``lighting`` documents the formula."""
   lit = jnp.maximum(cosine, -lighting.fill * cosine)
-  full = _FULL * (lighting.ambient + lighting.diffuse * lit)
+  full = _FULL * (look.ambient + look.diffuse * lit)
   return jnp.minimum(full, _FULL)  # rounding may make a cosine pass one
-
-
-def _odd_square(
-  plane: intersect.Frames, rays: intersect.Rays, t: Array, edge: float
-) -> Array:
-  """f32[P]: one on the odd squares of a plane's checker, zero on the even ones."""
-  x, y = intersect.plane_point(plane, rays, t)
-  square = jnp.floor(x / edge) + jnp.floor(y / edge)
-  return square - 2.0 * jnp.floor(square * 0.5)
 
 
 def _darken(
   geoms: Geoms,
   lighting: Lighting,
+  look: Look,
   frames: intersect.Frames,
   basis: Array,
   rays: intersect.Rays,

@@ -8,6 +8,7 @@ between light and point is taken for granted.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,14 +23,19 @@ Array = jax.Array
 _TINY = 1e-12
 
 
-def light_basis(direction: tuple[float, float, float]) -> np.ndarray:
-  """f32[3, 3]: rows e1, e2 across the light and l towards it, in world axes."""
-  toward = -np.asarray(direction, np.float64)
-  toward /= np.linalg.norm(toward)
-  helper = np.eye(3)[np.argmin(np.abs(toward))]
-  e1 = np.cross(helper, toward)
-  e1 /= np.linalg.norm(e1)
-  return np.stack([e1, np.cross(toward, e1), toward]).astype(np.float32)
+def light_basis(direction: Any, xp: Any = np) -> Any:
+  """f32[3, 3]: rows e1, e2 across the light and l towards it, in world axes.
+
+  Args:
+    direction: [3], in which the light travels.
+    xp: ``numpy`` or ``jax.numpy``.
+  """
+  toward = -xp.asarray(direction)
+  toward = toward / xp.linalg.norm(toward)
+  helper = xp.eye(3)[xp.argmin(xp.abs(toward))]
+  e1 = xp.cross(helper, toward)
+  e1 = e1 / xp.linalg.norm(e1)
+  return xp.stack([e1, xp.cross(toward, e1), toward]).astype(np.float32)
 
 
 def capsule_shadow(g: Frames, rays: Rays, t: Array, basis: Array) -> Array:

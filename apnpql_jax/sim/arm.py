@@ -14,8 +14,8 @@ from apnpql_jax.types import ARM_DOF, Array
 class ArmChain(struct.PyTreeNode):
   """The serial chain from the world to the tool site, lengths in m."""
 
-  base_pos: Array  # f32[3]: parent of the first link in the world
-  base_mat: Array  # f32[3, 3]
+  base_pos: Array  # f32[*b, 3]: parent of the first link in the world
+  base_mat: Array  # f32[*b, 3, 3]
   link_pos: Array  # f32[6, 3]: joint frame in its parent link at q = 0
   link_mat: Array  # f32[6, 3, 3]
   axis: Array  # f32[6, 3]: unit joint axes in the link frame
@@ -44,6 +44,22 @@ def make_chain(scene: Scene) -> ArmChain:
     "tool_mat": last_mat.T @ tool_mat,
   }
   return ArmChain(**{k: jnp.asarray(v, jnp.float32) for k, v in arrays.items()})
+
+
+def with_base(chain: ArmChain, scene: Scene, fields: dict[str, Array]) -> ArmChain:
+  """The arm of worlds whose robots stand differently; for angles f32[worlds, n, 6].
+
+  Args:
+    chain: the arm as the scene has it.
+    scene: names its base.
+    fields: of ``PhysicsState``, [worlds, ...]; without poses of bodies the arm stays.
+  """
+  base = scene.id("body", "base")
+  if "body_pos" in fields:
+    chain = chain.replace(base_pos=fields["body_pos"][:, None, base])
+  if "body_quat" in fields:
+    chain = chain.replace(base_mat=_rotation(fields["body_quat"][:, None, base]))
+  return chain
 
 
 def forward(chain: ArmChain, q: Array) -> tuple[Array, Array, Array]:
@@ -97,6 +113,16 @@ def _axis_rotation(axis: Array, angle: Array) -> Array:
   skew = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
   sine, cosine = jnp.sin(angle)[..., None, None], jnp.cos(angle)[..., None, None]
   return jnp.eye(3) + sine * skew + (1 - cosine) * (skew @ skew)
+
+
+def _rotation(quat: Array) -> Array:
+  """Rotations f32[*b, 3, 3] of unit quaternions f32[*b, 4] (wxyz)."""
+  w, v = quat[..., :1, None], quat[..., 1:]
+  zero = jnp.zeros_like(v[..., 0])
+  x, y, z = jnp.moveaxis(v, -1, 0)
+  skew = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1)
+  skew = skew.reshape(*v.shape, 3)
+  return jnp.eye(3) + 2 * (w * skew + skew @ skew)
 
 
 def _quat_to_mat(quat: np.ndarray) -> np.ndarray:

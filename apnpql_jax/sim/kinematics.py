@@ -9,7 +9,7 @@ import jax
 from mujoco import mjx
 
 from apnpql_jax.sim.mjx_patches import patch_mjx
-from apnpql_jax.sim.physics import PhysicsState
+from apnpql_jax.sim.physics import PhysicsState, model_fields
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
 
@@ -23,7 +23,7 @@ class Kinematics(struct.PyTreeNode):
   site_xmat: Array  # f32[*b, nsite, 3, 3]
   cam_xpos: Array  # f32[*b, ncam, 3]
   cam_xmat: Array  # f32[*b, ncam, 3, 3]
-  geom_size: Array | None  # f32[*b, ngeom, 3]; None if the same in all worlds
+  fields: dict[str, Array]  # of ``PhysicsState``: some change what is seen
 
 
 def make_kinematics(scene: Scene) -> Callable[[PhysicsState], Kinematics]:
@@ -33,7 +33,7 @@ def make_kinematics(scene: Scene) -> Callable[[PhysicsState], Kinematics]:
   template = mjx.make_data(scene.model, impl="jax")
 
   def single(qpos, mocap_pos, mocap_quat, fields) -> Kinematics:
-    world = model.replace(**fields)
+    world = model.replace(**model_fields(fields))
     data = template.replace(qpos=qpos, mocap_pos=mocap_pos, mocap_quat=mocap_quat)
     data = mjx.camlight(world, mjx.kinematics(world, data))
     return Kinematics(
@@ -43,7 +43,7 @@ def make_kinematics(scene: Scene) -> Callable[[PhysicsState], Kinematics]:
       site_xmat=data.site_xmat,
       cam_xpos=data.cam_xpos,
       cam_xmat=data.cam_xmat,
-      geom_size=fields.get("geom_size"),
+      fields=fields,
     )
 
   def kinematics(state: PhysicsState) -> Kinematics:

@@ -36,7 +36,8 @@ class MjxPhysics:
     return jax.vmap(self._step_world)(state, velocity, close)
 
   def _step_world(self, state, velocity, close):
-    model = self._model.replace(**state.fields)
+    model = self._model.replace(**physics.model_fields(state.fields))
+    speed = state.fields.get("gripper_speed", physics.GRIPPER_SPEED)
     data = self._template.replace(
       qpos=state.qpos,
       qvel=state.qvel,
@@ -46,18 +47,27 @@ class MjxPhysics:
       time=state.time,
     )
 
-    def substep(carry, _):
-      return self._substep(model, carry, velocity, close), None
+    def substep(carry, index):
+      now, grip = velocity, close
+      if index is not None:
+        late = index < state.fields["control_delay"]
+        now = jnp.where(late, state.command[:6], velocity)
+        grip = jnp.where(late, state.command[6], close)
+      return self._substep(model, carry, now, grip, speed), None
 
-    data, _ = jax.lax.scan(substep, data, length=self._substeps)
+    indices, command = None, None
+    if state.command is not None:
+      indices, command = jnp.arange(self._substeps), jnp.append(velocity, close)
+    data, _ = jax.lax.scan(substep, data, indices, length=self._substeps)
     return state.replace(
+      command=command,
       qpos=data.qpos,
       qvel=data.qvel,
       qacc_warmstart=data.qacc_warmstart,
       time=data.time,
     )
 
-  def _substep(self, model, data, velocity, close):
+  def _substep(self, model, data, velocity, close, speed):
     # mjx.step with the control between its velocity and actuation stages, so that
     # mass matrix and bias are those of the present state and computed only once.
     arm = self.scene.arm_dof
@@ -74,6 +84,7 @@ class MjxPhysics:
       data.qvel[self.scene.gripper_dof],
       close,
       jnp,
+      speed=speed,
     )
     data = data.replace(ctrl=jnp.append(torque, finger))
     data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))

@@ -56,7 +56,8 @@ class PhysicsState(struct.PyTreeNode):
   mocap_pos: Array  # f32[*b, nmocap, 3]
   mocap_quat: Array  # f32[*b, nmocap, 4]
   time: Array  # f32[*b], s since the reset, plus START_TIME
-  fields: dict[str, Array]  # model fields that differ between worlds, [*b, ...]
+  fields: dict[str, Array]  # what differs between worlds, see model_fields; [*b, ...]
+  command: Array | None = None  # f32[*b, 7]: the last one, where commands are delayed
 
 
 class Physics(Protocol):
@@ -119,6 +120,22 @@ def initial_state(
   )
 
 
+OWN_FIELDS = (
+  "gripper_speed",  # f32[]: in place of GRIPPER_SPEED, m/s
+  "control_delay",  # f32[]: whole physics steps until a command takes effect
+  "background",  # f32[3]: see ``render.look``, like the rest
+  "geom_waves",  # f32[ngeom, 3, 4]
+  "geom_odd_rgb",  # f32[ngeom, 3]
+  "geom_grain",  # f32[ngeom]
+)
+"""Names in ``PhysicsState.fields`` that are not fields of MuJoCo's model."""
+
+
+def model_fields(fields: dict[str, Array]) -> dict[str, Array]:
+  """Those of ``PhysicsState.fields`` that replace fields of MuJoCo's model."""
+  return {name: value for name, value in fields.items() if name not in OWN_FIELDS}
+
+
 def arm_torque(mass: Any, bias: Any, qvel: Any, desired: Any, limit: Any) -> Any:
   """Inverse-dynamics torque of the arm; NumPy or JAX arrays.
 
@@ -141,7 +158,9 @@ def arm_torque(mass: Any, bias: Any, qvel: Any, desired: Any, limit: Any) -> Any
   return ((mass * acceleration[..., None, :]).sum(-1) + bias).clip(-limit, limit)
 
 
-def gripper_torque(angle: Any, velocity: Any, close: Any, xp: Any) -> Any:
+def gripper_torque(
+  angle: Any, velocity: Any, close: Any, xp: Any, *, speed: Any = GRIPPER_SPEED
+) -> Any:
   """Torque of the driven finger: fixed speed of the pad gap, bounded squeeze.
 
   An explicit servo in place of a MuJoCo velocity actuator, whose saturated force
@@ -152,11 +171,12 @@ def gripper_torque(angle: Any, velocity: Any, close: Any, xp: Any) -> Any:
     velocity: [*b] its velocity, rad/s.
     close: [*b] in {0, 1}.
     xp: ``numpy`` or ``jax.numpy``.
+    speed: [*b] or a number, of the pad gap, m/s.
 
   Returns:
     [*b] N m, positive closes.
   """
   slope = 2 * FINGER_LENGTH * xp.sin(angle.clip(0.0, 1.1) + FINGER_ANGLE)
-  desired = (2 * close - 1) * GRIPPER_SPEED / slope
+  desired = (2 * close - 1) * speed / slope
   torque = GRIPPER_GAIN * (desired - velocity)
   return torque.clip(-GRIPPER_TORQUE, GRIPPER_TORQUE)
