@@ -218,6 +218,14 @@ class AgentConfig:
   conv_overlap: bool = True
   """Second convolution 3x3 with stride 2; else 2x2 patches, faster but coarser."""
 
+  image_shift: int = 0
+  """Images of a batch are moved at random by up to so many pixels along each axis; 0:
+  they stay as they are."""
+
+  color_jitter: float = 0.0
+  """Colour channels of the images of a batch are multiplied at random by factors this
+  close to 1; 0: they stay as they are."""
+
   ap_delta: float = 0.1
   """Error in rad/s above which the loss of the action primitives becomes linear."""
 

@@ -29,8 +29,8 @@ class Observation(struct.PyTreeNode):
 
   robot: Array  # f32[*b, 21]: last three (6 joint, gripper angle), newest last, rad
   tool: Array | None = None  # f32[*b, 3]: tool position by forward kinematics, m
-  global_image: Array | None = None  # u8[*b, 72, 96, 3]
-  wrist_image: Array | None = None  # u8[*b, 36, 64, 3]
+  global_image: Array | None = None  # u8[*b, H, W, 3], EnvConfig.global_size
+  wrist_image: Array | None = None  # u8[*b, H, W, 3], EnvConfig.wrist_size
   objects: Array | None = None  # f32[*b, n]: positions, m, only under --obs state
 
 

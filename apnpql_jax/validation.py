@@ -14,7 +14,7 @@ from apnpql_jax import codec
 from apnpql_jax.codec import ConfigError
 
 if TYPE_CHECKING:
-  from apnpql_jax.config import AgentConfig, TrainConfig
+  from apnpql_jax.config import AgentConfig, EnvConfig, TrainConfig
 
 BACKENDS = ("auto", "mjx", "native")
 OBSERVATIONS = ("pixels", "state")
@@ -24,8 +24,27 @@ EVALUATIONS = ("row", "categorical", "td0", "retrace", "clipped_double_q")
 PRIOR_MEANS = ("primitives", "learned")
 
 MIN_BANK_ROWS = 16
+MAX_SHIFT = 16
+"""Pixels."""
+MAX_SIDE = 1024
+"""Pixels."""
+MAX_SHARE = 0.5
+"""Largest range of a randomised share or colour: nothing shrinks to nothing."""
+MAX_ABSOLUTE = {
+  "color": 1.0,
+  "texture": 1.0,
+  "light_turn": 0.9,
+  "camera_shift": 0.2,
+  "camera_turn": 0.3,
+  "table_height": 0.1,
+  "table_tilt": 0.1,
+  "size": 0.1,
+  "damping": 2.0,
+  "delay_s": 1.0,
+}
+"""Largest ranges of the others, in their units; objects of other sizes than these
+neither fit into the hand nor into what they are put into."""
 
-_PIXEL_BYTES = 3 * (72 * 96 + 36 * 64)
 _OTHER_BYTES = 4 * (21 + 3 + 7 + 21 + 2) + 2
 """Robot state, tool, action, primitive labels, reward, log density of the action (f32)
 and the two end flags."""
@@ -76,6 +95,7 @@ def validate(
     check_name("env.task", config.env.task, tasks)
   if algorithms is not None:
     check_name("agent.algorithm", config.agent.algorithm, tuple(algorithms))
+  _validate_env(config.env)
   _validate_agent(config.agent)
   limited = config.agent.temperature != "fixed"
   if limited and algorithms is not None and algorithms[config.agent.algorithm]:
@@ -91,7 +111,8 @@ def check_name(field: str, value: str, valid: Sequence[str]) -> None:
 
 def replay_bytes(config: TrainConfig) -> int:
   """Bytes the agent and expert replays take at most (object poses not counted)."""
-  slot = _OTHER_BYTES + (_PIXEL_BYTES if config.env.obs == "pixels" else 0)
+  images = math.prod(config.env.global_size) + math.prod(config.env.wrist_size)
+  slot = _OTHER_BYTES + (3 * images if config.env.obs == "pixels" else 0)
   return slot * (config.replay.capacity + config.replay.expert_steps)
 
 
@@ -123,6 +144,25 @@ def _validate_ranges(config: TrainConfig) -> None:
     )
 
 
+def _validate_env(env: EnvConfig) -> None:
+  for name in ("global_size", "wrist_size"):
+    size = getattr(env, name)
+    if len(size) != 2 or min(size) < 1 or max(size) > MAX_SIDE:
+      raise ConfigError(
+        f"env.{name}={size} must be height and width, each from 1 to {MAX_SIDE} pixels"
+      )
+  for name, value in codec.flatten(env.randomization, "env.randomization."):
+    most = MAX_ABSOLUTE.get(name.rpartition(".")[2], MAX_SHARE)
+    if not 0.0 <= value <= most:
+      raise ConfigError(f"{name}={value} must be within [0, {most}]")
+  delay = env.randomization.delay_s
+  if env.randomize and delay >= env.control_period_s:
+    raise ConfigError(
+      f"env.randomization.delay_s={delay} must be below env.control_period_s="
+      f"{env.control_period_s}: a command is late by less than the next one"
+    )
+
+
 def _validate_agent(agent: AgentConfig) -> None:
   check_name("agent.temperature", agent.temperature, TEMPERATURES)
   check_name("agent.regulariser", agent.regulariser, REGULARISERS)
@@ -134,6 +174,12 @@ def _validate_agent(agent: AgentConfig) -> None:
   for name in ("target_samples", "policy_samples", "num_atoms"):
     if getattr(agent, name) < 2:
       raise ConfigError(f"agent.{name}={getattr(agent, name)} must be at least 2")
+  if not 0 <= agent.image_shift <= MAX_SHIFT:
+    raise ConfigError(
+      f"agent.image_shift={agent.image_shift} must be within [0, {MAX_SHIFT}] pixels"
+    )
+  if not 0.0 <= agent.color_jitter <= 1.0:
+    raise ConfigError(f"agent.color_jitter={agent.color_jitter} must be within [0, 1]")
   if agent.v_min >= agent.v_max:
     raise ConfigError(
       f"agent.v_min={agent.v_min} must be below agent.v_max={agent.v_max}"
@@ -200,6 +246,11 @@ def _validate_replay(config: TrainConfig, memory_bytes: int | None) -> None:
     raise ConfigError(
       "replay.expert_steps=0 leaves no room for replay.demonstrations="
       f"{replay.demonstrations}"
+    )
+  if replay.demonstrations and config.env.randomize:
+    raise ConfigError(
+      f"replay.demonstrations={replay.demonstrations} cannot be used with "
+      "env.randomize: they show the world of the scene file"
     )
   if replay.capacity % per_iteration:
     raise ConfigError(

@@ -53,19 +53,19 @@ class Sheet:
 def main() -> None:
   """Command line; see the module's docstring."""
   sheet = tyro.cli(Sheet, description=(__doc__ or "").splitlines()[0])
-  rows = [draw(sheet, task) for task in task_names()]
+  rows = [draw(sheet, task, number) for number, task in enumerate(task_names())]
   sheet.out.parent.mkdir(parents=True, exist_ok=True)
   iio.imwrite(sheet.out, np.concatenate(rows))
 
 
-def draw(sheet: Sheet, task: str) -> np.ndarray:
+def draw(sheet: Sheet, task: str, number: int) -> np.ndarray:
   """u8[H, W, 3]: a row of tiles."""
   env = make_env(dataclasses.replace(sheet.env, task=task, worlds=sheet.worlds))
   policy = expert_policy(env, noise=0.0)
   play = jax.jit(
     lambda rows, key: rollout(env, policy, env.reset(rows), key, length=PERIODS)[0]
   )
-  rows = jnp.arange(sheet.worlds)
+  rows = number * sheet.worlds + jnp.arange(sheet.worlds)
   observation = play(rows, jax.random.key(0)).timestep.observation
   tiles = zip(observation.global_image, observation.wrist_image, strict=True)
   return np.concatenate([_tile(*map(np.asarray, pair)) for pair in tiles], axis=1)

@@ -16,6 +16,7 @@ from apnpql_jax.config import (
   AgentConfig,
   ConfigError,
   EnvConfig,
+  RandomizationConfig,
   ReplayConfig,
   TrainConfig,
   config_diff,
@@ -70,13 +71,17 @@ def test_every_field_has_a_docstring():
         fields += 1
         assert isinstance(after, ast.Expr), f"{cls.name}.{ast.unparse(node.target)}"
         assert isinstance(after.value, ast.Constant)
-  expected = (EnvConfig, AgentConfig, ReplayConfig, TrainConfig)
+  expected = (RandomizationConfig, EnvConfig, AgentConfig, ReplayConfig, TrainConfig)
   assert fields == sum(len(dataclasses.fields(cls)) for cls in expected)
 
 
 @pytest.mark.parametrize(
   ("path", "value", "words"),
   [
+    ("env.global_size", (72, 0), ["env.global_size=(72, 0)", "1 to 1024"]),
+    ("env.wrist_size", (36,), ["env.wrist_size", "height and width"]),
+    ("env.randomization.size", 0.3, ["env.randomization.size=0.3", "[0, 0.1]"]),
+    ("env.randomization.mass", -0.1, ["env.randomization.mass=-0.1", "[0, 0.5]"]),
     ("env.backend", "bullet", ["auto", "mjx", "native"]),
     ("env.obs", "depth", ["pixels", "state"]),
     ("env.task", "juggle", ["push_plate", "stack_box"]),
@@ -159,6 +164,23 @@ def test_replay_larger_than_memory_is_refused():
   slots = 51_200 + 6_400
   assert need > slots * 3 * (72 * 96 + 36 * 64)
   assert replay_bytes(changed("env.obs", "state")) < need / 100
+  large = replay_bytes(changed("env.global_size", (120, 160)))
+  slots = ReplayConfig().capacity + ReplayConfig().expert_steps
+  assert large - need == 3 * (120 * 160 - 72 * 96) * slots
+
+
+def test_demonstrations_do_not_show_randomised_worlds():
+  config = TrainConfig(
+    env=EnvConfig(randomize=True), replay=ReplayConfig(demonstrations="mine.npz")
+  )
+  with pytest.raises(ConfigError, match="cannot be used with env.randomize"):
+    validate(config)
+
+
+def test_a_command_may_not_be_later_than_the_next_one():
+  env = EnvConfig(randomize=True, randomization=RandomizationConfig(delay_s=0.15))
+  with pytest.raises(ConfigError, match="delay_s=0.15 must be below.*=0.15"):
+    validate(TrainConfig(env=env))
 
 
 def test_episode_steps_of_the_paper():

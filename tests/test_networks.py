@@ -40,7 +40,7 @@ def observation(batch: int, *, pixels: bool, objects: bool = False) -> Observati
   )
 
 
-@pytest.mark.parametrize("shape", [(72, 96), (36, 64), (120, 160)])
+@pytest.mark.parametrize("shape", [(72, 96), (36, 64), (120, 160), (60, 107)])
 @pytest.mark.parametrize("overlap", [True, False])
 def test_pixel_encoder_is_two_convolutions(shape: tuple[int, int], overlap: bool):
   height, width = shape

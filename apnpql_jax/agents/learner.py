@@ -13,6 +13,7 @@ import optax
 
 from apnpql_jax.agents import objectives
 from apnpql_jax.agents.algorithms import Algorithm, algorithm_of, epsilon_is_bounded
+from apnpql_jax.agents.augmentation import augment
 from apnpql_jax.agents.networks import Heads, Networks, Params, make_networks
 from apnpql_jax.agents.policies import Candidates
 from apnpql_jax.config import AgentConfig, TrainConfig, validate
@@ -82,6 +83,13 @@ def make_agent(config: AgentConfig) -> Agent:
     state: LearnerState, batch: Transition, key: Array
   ) -> tuple[LearnerState, Metrics]:
     key_t, key_tm1 = jax.random.split(key)
+    if config.image_shift or config.color_jitter:
+      batch = augment(
+        jax.random.fold_in(key, 1),
+        batch,
+        shift=config.image_shift,
+        jitter=config.color_jitter,
+      )
     target = bellman_target(networks, algorithm, state.target_params, batch, key_t)
     trained = {**state.params, "nu": state.nu}
     grads, metrics = jax.grad(total_loss, argnums=2, has_aux=True)(

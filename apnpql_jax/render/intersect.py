@@ -141,6 +141,23 @@ def _ball(b: Array, c: Array, rays: Rays) -> tuple[Array, Array]:
   return (b - root) * rays.inv_norm2, discriminant > 0.0
 
 
+def ellipsoid_hit(g: Frames, rays: Rays, ray_light: Array) -> tuple[Array, Array]:
+  """An ellipsoid of half axes size, which is a ball where these measure lengths."""
+  del ray_light
+  inv = 1.0 / jnp.maximum(g.size, _TINY)
+  x, y, z = (along(axis, rays) * inv[k] for k, axis in enumerate((g.x, g.y, g.z)))
+  p, q, r = (g.offset[k] * inv[k] for k in range(3))
+  a, b = x * x + y * y + z * z, x * p + y * q + z * r
+  # As of a tube, by a cross product.
+  cross = (y * r - z * q, z * p - x * r, x * q - y * p)
+  discriminant = a - (cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2])
+  t = (b - jnp.sqrt(jnp.maximum(discriminant, 0.0))) / a
+  normal = ((t * x - p) * inv[0], (t * y - q) * inv[1], (t * z - r) * inv[2])
+  length2 = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
+  cosine = normal[0] * g.light[0] + normal[1] * g.light[1] + normal[2] * g.light[2]
+  return jnp.where(discriminant > 0.0, t, MISS), cosine * jax.lax.rsqrt(length2)
+
+
 def _tube(g: Frames, rays: Rays) -> tuple[Array, Array, Array, Array, Array, Array]:
   """Entry and exit of the infinite cylinder of radius size[0] along the geom's z.
 
@@ -219,6 +236,7 @@ HITS: dict[int, Hit] = {
   int(mujoco.mjtGeom.mjGEOM_PLANE): plane_hit,
   int(mujoco.mjtGeom.mjGEOM_SPHERE): sphere_hit,
   int(mujoco.mjtGeom.mjGEOM_CAPSULE): capsule_hit,
+  int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): ellipsoid_hit,
   int(mujoco.mjtGeom.mjGEOM_BOX): box_hit,
   int(mujoco.mjtGeom.mjGEOM_CYLINDER): cylinder_hit,
 }

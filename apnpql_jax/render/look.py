@@ -15,6 +15,7 @@ import numpy as np
 
 from apnpql_jax.render.geoms import CameraSpec, Geoms, Lighting
 from apnpql_jax.render.shadow import light_basis
+from apnpql_jax.render.texture import Texture
 
 Array = jax.Array
 
@@ -38,8 +39,7 @@ class Look(NamedTuple):
 
   sizes: Array | np.ndarray  # f32[n, 3]: of the n geoms that are drawn, m
   palette: Array | np.ndarray  # f32[2 n + 1, 3]: geoms, their odd squares, background
-  waves: Array | None  # f32[n, 3, 4]; None: textures as in the scene file
-  grain: Array | None  # f32[n]
+  texture: Texture | None  # None: as in the scene file
   light: Array | np.ndarray  # f32[3, 3]: see ``shadow.light_basis``
   ambient: Array | float
   diffuse: Array | float
@@ -58,11 +58,11 @@ def make_look(
     fields: some of ``FIELDS``, without leading axes.
   """
   ids, light = geoms.ids, lighting.id
-  colors, odd, waves, grain = geoms.colors, geoms.checker_colors, None, None
+  colors, odd, texture = geoms.colors, geoms.checker_colors, None
   if "geom_rgba" in fields:
     colors = fields["geom_rgba"][ids, :3]
   if "geom_waves" in fields:
-    waves, grain = fields["geom_waves"][ids], fields["geom_grain"][ids]
+    texture = Texture(fields["geom_waves"][ids], fields["geom_grain"][ids])
     odd = fields["geom_odd_rgb"][ids]
   background = np.array([lighting.background], np.float32)
   if "background" in fields:
@@ -77,8 +77,7 @@ def make_look(
   return Look(
     sizes=fields["geom_size"][ids] if "geom_size" in fields else geoms.sizes,
     palette=_join(colors, odd, background),
-    waves=waves,
-    grain=grain,
+    texture=texture,
     light=light_basis(lighting.direction) if basis is None else basis,
     ambient=ambient,
     diffuse=diffuse,

@@ -126,15 +126,15 @@ def _render_one(
   cast = functools.partial(_cast, geoms, lighting, look, frames, basis, near)
   t = paint = None
   # A loop each: with two results XLA would not keep the fold in one piece.
-  textured = look.waves is not None and "rgb" in outputs
-  if "depth" in outputs or textured:
+  if "depth" in outputs or look.texture is not None:
     t = jax.lax.map(lambda rays: cast(rays)[0], blocks)
   if "rgb" in outputs or "segmentation" in outputs:
     paint = jax.lax.map(lambda rays: cast(rays)[1], blocks)
-  if textured:
-    draw = functools.partial(texture.textured, frames, look.waves, look.grain)
-    paint = jax.lax.map(lambda seen: draw(*seen), (blocks, t, paint))
-  return _develop(geoms, camera, look.palette, outputs, t, paint)
+    if look.texture is not None:
+      draw = functools.partial(texture.textured, frames, look.texture)
+      paint = jax.lax.map(lambda seen: draw(*seen), (blocks, t, paint))
+  depth = t if "depth" in outputs else None
+  return _develop(geoms, camera, look.palette, outputs, depth, paint)
 
 
 def _blocks(camera: CameraSpec, zoom: Array | None) -> intersect.Rays:
@@ -159,7 +159,7 @@ def _develop(
   shape = (camera.height, camera.width)
   pixels = camera.height * camera.width
   depth = rgb = segmentation = None
-  if "depth" in outputs:
+  if t is not None:
     t = t.reshape(-1)[:pixels]
     depth = jnp.where(t < intersect.MISS, t, jnp.inf).reshape(shape)
   if paint is not None:
@@ -198,7 +198,7 @@ def _cast(
     geom = intersect.row(frames, k)
     t_k, cosine = intersect.HITS[kind](geom, rays, ray_light)
     index = float(k)
-    if look.waves is None and geoms.checker[k] > 0.0:
+    if look.texture is None and geoms.checker[k] > 0.0:
       edge = float(geoms.checker[k])
       x, y = intersect.plane_point(geom, rays, t_k)
       index = index + len(geoms.ids) * texture.odd_square(x / edge, y / edge)

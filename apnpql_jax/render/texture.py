@@ -7,12 +7,21 @@ their height takes some of its brightness, which gives noise if they do not.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
 from apnpql_jax.render.intersect import Frames, Rays
 
 Array = jax.Array
+
+
+class Texture(NamedTuple):
+  """Waves through n geoms."""
+
+  waves: Array  # f32[n, 3, 4]: vectors in the geom's own frame, 1/m; phases, turns
+  grain: Array  # f32[n]: share of the brightness that noise takes at most
 
 
 def odd_square(x: Array, y: Array) -> Array:
@@ -25,7 +34,7 @@ def _odd(x: Array) -> Array:
 
 
 def textured(
-  frames: Frames, waves: Array, grain: Array, rays: Rays, t: Array, paint: Array
+  frames: Frames, texture: Texture, rays: Rays, t: Array, paint: Array
 ) -> Array:
   """f32[P]: paint with the texture of what has been hit.
 
@@ -34,12 +43,12 @@ def textured(
 
   Args:
     frames: of the n geoms, [n, ...].
-    waves: f32[n, 3, 4], wave vectors in the geoms' own frames, 1/m, and phases, turns.
-    grain: f32[n], share of the brightness that noise takes at most.
+    texture: of the n geoms.
     rays: rays of the image.
     t: f32[P], depth of what has been hit on each ray.
     paint: f32[P], see ``raycast``; n or more is not textured.
   """
+  waves, grain = texture
   axes = jnp.stack([frames.x, frames.y, frames.z], axis=1)
   # In the camera's frame: the phase at a depth is then one inner product with the ray.
   ahead = (waves[:, :, :3, None] * axes[:, None]).sum(axis=2)

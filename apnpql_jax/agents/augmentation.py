@@ -1,0 +1,85 @@
+"""Augmentation of the images of a batch: random shifts and colour jitter.
+
+A network that sees each image a little elsewhere and in other colours cannot tell
+states by single pixels.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+
+from apnpql_jax.types import Array, Observation, Transition
+
+_IMAGES = ("global_image", "wrist_image")
+
+
+def augment(key: Array, batch: Transition, *, shift: int, jitter: float) -> Transition:
+  """The batch with other images; each image of each instant by itself.
+
+  Args:
+    key: typed PRNG key.
+    batch: [B, ...].
+    shift: largest shift along each axis, pixels; 0 for none.
+    jitter: largest change of brightness of each colour channel, a share; 0 for none.
+  """
+  changed = functools.partial(_observation, shift=shift, jitter=jitter)
+  keys = jax.random.split(key, 3)
+  batch = batch.replace(
+    observation_tm1=changed(keys[0], batch.observation_tm1),
+    observation_t=changed(keys[1], batch.observation_t),
+  )
+  if batch.window is None:
+    return batch
+  timestep = batch.window.timestep
+  timestep = timestep.replace(observation=changed(keys[2], timestep.observation))
+  return batch.replace(window=batch.window.replace(timestep=timestep))
+
+
+def _observation(
+  key: Array, observation: Observation, *, shift: int, jitter: float
+) -> Observation:
+  for index, name in enumerate(_IMAGES):
+    image = getattr(observation, name)
+    if image is None:
+      continue
+    shift_key, color_key = jax.random.split(jax.random.fold_in(key, index))
+    if shift:
+      image = shifted(shift_key, image, shift)
+    if jitter:
+      image = jittered(color_key, image, jitter)
+    observation = observation.replace(**{name: image})
+  return observation
+
+
+def shifted(key: Array, image: Array, most: int) -> Array:
+  """Moves images by whole pixels; the border is repeated where nothing is known.
+
+  Args:
+    key: typed PRNG key.
+    image: u8[*b, H, W, 3].
+    most: largest shift along each axis, pixels.
+  """
+  flat = image.reshape(-1, *image.shape[-3:])
+  padded = jnp.pad(flat, ((0, 0), (most, most), (most, most), (0, 0)), "edge")
+  starts = jax.random.randint(key, (len(flat), 2), 0, 2 * most + 1)
+
+  def crop(image: Array, start: Array) -> Array:
+    return jax.lax.dynamic_slice(image, (start[0], start[1], 0), flat.shape[1:])
+
+  return jax.vmap(crop)(padded, starts).reshape(image.shape)
+
+
+def jittered(key: Array, image: Array, most: float) -> Array:
+  """Multiplies each colour channel of each image by a factor of its own.
+
+  Args:
+    key: typed PRNG key.
+    image: u8[*b, H, W, 3].
+    most: factors lie within 1 - most and 1 + most.
+  """
+  shape = (*image.shape[:-3], 1, 1, 3)
+  factor = 1.0 + jax.random.uniform(key, shape, jnp.float32, -most, most)
+  return jnp.minimum(jnp.round(image * factor), 255.0).astype(jnp.uint8)

@@ -1,0 +1,25 @@
+"""Put a plate into a box in randomised worlds (paper Sec. V-C).
+
+The agent of push_plate, with larger images, as the paper has for its transfer to a real
+robot, and a shadow.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+from apnpql_jax.presets import load_preset
+
+_PLACE = load_preset("place_plate")
+
+CONFIG = dataclasses.replace(
+  _PLACE,
+  env=dataclasses.replace(
+    _PLACE.env,
+    randomize=True,
+    shadows=True,
+    global_size=(120, 160),
+    wrist_size=(60, 107),
+  ),
+  total_steps=204_800,
+)
