@@ -247,6 +247,17 @@ def test_with_all_ranges_zero_it_is_as_if_it_were_not_there(plain_env):
   assert _bits(off) == _bits(zero)
 
 
+def test_a_state_keeps_its_types(plain_env):
+  """So that one compilation serves every iteration."""
+  config = dataclasses.replace(CONFIG, obs="pixels", shadows=True, randomize=True)
+  env = Env(config, plain_env.task, plain_env._bank)
+  start = jax.eval_shape(env.reset, jnp.arange(4))
+  after = jax.eval_shape(env.step, start, jnp.zeros((4, 7)), jax.random.key(0))
+  types = lambda x: (x.shape, x.dtype, x.weak_type)  # noqa: E731
+  assert jax.tree.map(types, start) == jax.tree.map(types, after)
+  assert not any(x.weak_type for x in jax.tree.leaves(start))
+
+
 def test_each_episode_has_a_world_of_its_own(plain_env):
   env = Env(
     dataclasses.replace(CONFIG, randomize=True), plain_env.task, plain_env._bank
