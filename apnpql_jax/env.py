@@ -234,9 +234,8 @@ def make_env(config: EnvConfig) -> Env:
       control period that is not made of whole steps, or no resets within reach.
   """
   task = make_task(config.task)
-  make_cameras(
-    config, task.scene
-  )  # Refuses what cannot be drawn before the bank is built.
+  # What cannot be drawn is refused before the bank is built.
+  make_cameras(config, task.scene)
   bank, _ = load_bank(task, config.bank_rows)
   return Env(config, task, bank)
 

@@ -106,7 +106,7 @@ class NativePhysics:
     for substep in range(self._substeps):
       now = command
       if "command" in control:
-        late = substep < control["control_delay"]
+        late = np.less(substep, control["control_delay"])
         now = np.where(late[:, None], control["command"], command)
       ctrl[:, :6] = physics.arm_torque(
         mass[:, self._mass_index],
