@@ -215,6 +215,13 @@ class AgentConfig:
   conv_channels: int = 32
   """Channels of the second convolution of each camera."""
 
+  global_features: str = "map"
+  """What is kept of the convolutions of the global camera: map (flattened); keypoints
+  (where each channel scores highest), which learn from fewer scenes; or both."""
+
+  wrist_features: str = "map"
+  """The same for the camera on the wrist."""
+
   conv_overlap: bool = True
   """Second convolution 3x3 with stride 2; else 2x2 patches, faster but coarser."""
 

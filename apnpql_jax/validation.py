@@ -22,6 +22,7 @@ TEMPERATURES = ("state", "shared", "fixed")
 REGULARISERS = ("row", "uniform")
 EVALUATIONS = ("row", "categorical", "td0", "retrace", "clipped_double_q")
 PRIOR_MEANS = ("primitives", "learned")
+IMAGE_FEATURES = ("map", "keypoints", "both")
 
 MIN_BANK_ROWS = 16
 MAX_SHIFT = 16
@@ -168,6 +169,8 @@ def _validate_agent(agent: AgentConfig) -> None:
   check_name("agent.regulariser", agent.regulariser, REGULARISERS)
   check_name("agent.policy_evaluation", agent.policy_evaluation, EVALUATIONS)
   check_name("agent.prior_mean", agent.prior_mean, PRIOR_MEANS)
+  check_name("agent.global_features", agent.global_features, IMAGE_FEATURES)
+  check_name("agent.wrist_features", agent.wrist_features, IMAGE_FEATURES)
   for name in ("gamma", "target_rate"):
     if not 0.0 < getattr(agent, name) <= 1.0:
       raise ConfigError(f"agent.{name}={getattr(agent, name)} must be within (0, 1]")

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import special
 
 from apnpql_jax.agents import encoder
 from apnpql_jax.agents.evaluation import Categorical
@@ -15,6 +16,7 @@ from apnpql_jax.agents.mixture import mixture_from_outputs, one_way_clip
 from apnpql_jax.agents.networks import GROUPS, Heads, Networks, make_networks
 from apnpql_jax.config import AgentConfig
 from apnpql_jax.types import Observation
+from apnpql_jax.validation import IMAGE_FEATURES
 
 CONFIG = AgentConfig(
   hidden=(24, 16), feature_dim=20, num_atoms=11, patch_channels=5, conv_channels=6
@@ -47,7 +49,7 @@ def test_pixel_encoder_is_two_convolutions(shape: tuple[int, int], overlap: bool
   rng = np.random.default_rng(1)
   image = jnp.asarray(rng.integers(0, 256, (2, height, width, 3)), jnp.uint8)
   module = encoder.PixelEncoder((5, 6), overlap)
-  ours, variables = module.init_with_output(jax.random.key(0), image)
+  (flat, points), variables = module.init_with_output(jax.random.key(0), image)
   params = variables["params"]
 
   def convolve(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
@@ -58,7 +60,7 @@ def test_pixel_encoder_is_two_convolutions(shape: tuple[int, int], overlap: bool
   pad = ((0, 0), (0, -height % 8), (0, -width % 8), (0, 0))
   x = jnp.pad(image, pad).astype(jnp.float32) / 255.0
   x = convolve(x, params["patches"]["kernel"].reshape(4, 4, 3, 5), 4)
-  x = jax.nn.relu(x + params["patches"]["bias"].reshape(1, 1, 1, -1))
+  first = x + params["patches"]["bias"]
   rows = params["conv"]["kernel"].reshape(-1, 5, 6)
   if overlap:
     # Window positions in the order in which ``windows`` stacks them.
@@ -69,8 +71,31 @@ def test_pixel_encoder_is_two_convolutions(shape: tuple[int, int], overlap: bool
     kernel = jnp.zeros((2, 2, 5, 6))
   for place, row in zip(places, rows, strict=True):
     kernel = kernel.at[place].set(row)
-  x = jax.nn.relu(convolve(x, kernel, 2) + params["conv"]["bias"].reshape(1, 1, 1, -1))
-  np.testing.assert_allclose(ours, x.reshape(2, -1), rtol=1e-4, atol=1e-5)
+  second = convolve(jax.nn.relu(first), kernel, 2) + params["conv"]["bias"]
+  expected = jax.nn.relu(second).reshape(2, -1)
+  np.testing.assert_allclose(flat, expected, rtol=1e-4, atol=1e-5)
+  expected = np.concatenate([expected_positions(x) for x in (first, second)], axis=-1)
+  np.testing.assert_allclose(points, expected, atol=1e-4)
+
+
+def expected_positions(scores: jax.Array) -> np.ndarray:
+  """f32[b, H, W, C] -> f64[b, 2 C], by a histogram of each axis."""
+  _, height, width, _ = scores.shape
+  shares = special.softmax(4.0 * np.asarray(scores, np.float64), axis=(1, 2))
+  row = np.einsum("bhwc,h->bc", shares, np.linspace(-1, 1, 2 * height + 1)[1::2])
+  column = np.einsum("bhwc,w->bc", shares, np.linspace(-1, 1, 2 * width + 1)[1::2])
+  return np.stack([row, column], axis=-1).reshape(len(shares), -1)
+
+
+@pytest.mark.parametrize("parts", [1, 4])
+def test_a_keypoint_is_where_its_channel_peaks(parts: int):
+  scores = jnp.zeros((3, 4, parts, 2)).at[2, 1, parts - 1, 0].set(100.0)
+  points = encoder.keypoints(scores.at[0, 3, 0, 1].set(100.0)).reshape(2, 2)
+  # Centres of the cells, or of their last and first quarters.
+  off = 0.25 if parts == 4 else 0.0
+  expected = [[(2.5 + off) / 1.5 - 1, (1.5 + off) / 2 - 1]]
+  expected += [[(0.5 - off) / 1.5 - 1, (3.5 - off) / 2 - 1]]
+  np.testing.assert_allclose(points, expected, atol=1e-5)
 
 
 def test_space_to_depth_of_numbered_pixels():
@@ -111,8 +136,10 @@ def test_outputs_have_the_declared_shapes(pixels: bool, objects: bool):
 
 
 @pytest.mark.parametrize("changed", ["robot", "global_image", "wrist_image"])
-def test_features_depend_on_every_modality(changed: str):
-  networks = all_networks()
+@pytest.mark.parametrize("kind", IMAGE_FEATURES)
+def test_features_depend_on_every_modality(changed: str, kind: str):
+  config = dataclasses.replace(CONFIG, global_features=kind, wrist_features=kind)
+  networks = all_networks(config)
   seen = observation(2, pixels=True)
   params = networks.init(jax.random.key(0), seen)
   other = seen.replace(**{changed: getattr(seen, changed) // 2})

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import functools
+import math
 
 from flax import linen as nn
 import jax.numpy as jnp
+import numpy as np
 
 from apnpql_jax.types import ARM_DOF, Array, Observation
 
@@ -20,40 +22,48 @@ _POSITION_SCALE = 5.0
 """Brings positions within reach of the arm (m) to order one, centimetres to 0.05."""
 
 
+_SHARPNESS = 4.0
+"""Scales the scores of keypoints: each looks at a part of the image from the start."""
+
+
 class PixelEncoder(nn.Module):
-  """Two convolution layers with relu for one camera, flattened.
+  """Two convolution layers for one camera.
 
   A 4x4 convolution with stride 4, then a 3x3 one with stride 2 (or 2x2 without
   overlap), both written as matrix products: XLA:CPU runs a convolution inside a scan,
   where updates live, up to ten times slower. Images are padded with black to whole
-  cells of 8x8 pixels. The map is flattened, not pooled: where a thing is must survive.
+  cells of 8x8 pixels.
   """
 
   channels: Sequence[int]
   overlap: bool
 
   @nn.compact
-  def __call__(self, image: Array) -> Array:
-    """u8[*b, H, W, 3] -> f32[*b, n]."""
+  def __call__(self, image: Array) -> tuple[Array, Array]:
+    """u8[*b, H, W, 3] -> map f32[*b, n], after relu and flattened, not pooled: where a
+    thing is must survive; keypoints f32[*b, m] of both layers."""
     first, second = self.channels
     # Rearranged while still bytes, a quarter of the traffic, and by cells of four
     # patches, so that the second layer finds its windows without strided copies.
     cells = space_to_depth(space_to_depth(image, PATCH), 2)
     cells = cells.reshape(*cells.shape[:-1], 4, -1).astype(jnp.float32) / 255.0
-    cells = nn.relu(nn.Dense(first, name="patches")(cells))
+    patches = nn.Dense(first, name="patches")(cells)
+    cells = nn.relu(patches)
     if self.overlap:
       x = windows(cells)
     else:
       x = cells.reshape(*cells.shape[:-2], -1)
-    x = nn.relu(nn.Dense(second, name="conv")(x))
-    return x.reshape(*image.shape[:-3], -1)
+    x = nn.Dense(second, name="conv")(x)
+    points = jnp.concatenate([keypoints(patches), keypoints(x[..., None, :])], axis=-1)
+    return nn.relu(x).reshape(*image.shape[:-3], -1), points
 
 
 class Encoder(nn.Module):
   """Feature extractor f^fe: observation -> phi (paper Sec. IV-B).
 
-  Each modality present has its own projection, and the projections are summed, so
-  that thousands of pixel features do not drown a few dozen of the robot. The layer
+  Keypoints of a camera are positions and go with those of the robot. A map has its own
+  projection, and the projections are summed, so that thousands of pixel features do not
+  drown a few dozen of the robot. The layer
   norm gives phi a fixed scale: the heads that read phi without training it (prior,
   alpha) then follow the encoder instead of chasing its growing activations.
   """
@@ -61,6 +71,8 @@ class Encoder(nn.Module):
   feature_dim: int
   channels: Sequence[int]
   overlap: bool
+  global_features: str
+  wrist_features: str
 
   @nn.compact
   def __call__(self, observation: Observation) -> Array:
@@ -70,14 +82,43 @@ class Encoder(nn.Module):
     for positions in (observation.tool, observation.objects):
       if positions is not None:
         state.append(_POSITION_SCALE * positions)
-    state = nn.relu(body(name="state")(jnp.concatenate(state, axis=-1)))
-    x = body(name="from_state")(state)
-    for name in ("global_image", "wrist_image"):
+    maps = []
+    kinds = {"global_image": self.global_features, "wrist_image": self.wrist_features}
+    for name, kind in kinds.items():
       image = getattr(observation, name)
       if image is not None:
-        pixels = PixelEncoder(self.channels, self.overlap, name=name)(image)
-        x = x + body(name=f"from_{name}", use_bias=False)(pixels)
+        pixels, points = PixelEncoder(self.channels, self.overlap, name=name)(image)
+        if kind != "map":
+          state.append(points)
+        if kind != "keypoints":
+          maps.append(body(name=f"from_{name}", use_bias=False)(pixels))
+    state = nn.relu(body(name="state")(jnp.concatenate(state, axis=-1)))
+    x = sum(maps, body(name="from_state")(state))
     return nn.relu(nn.LayerNorm(name="norm")(x))
+
+
+def keypoints(scores: Array) -> Array:
+  """Where in the image each channel scores highest (spatial soft-argmax).
+
+  The expected position under a softmax over the map (Levine et al. 2016): a position
+  seen in one place of the image is understood in all others.
+
+  Args:
+    scores: f32[*b, R, S, P, C], cells of one position, or of the four 00, 01, 10, 11.
+
+  Returns:
+    f32[*b, 2 C] within [-1, 1], the row and the column of each channel.
+  """
+  *batch, rows, columns, parts, channels = scores.shape
+  side = math.isqrt(parts)
+  down, across = (np.stack(np.divmod(np.arange(parts), side)) + 0.5) / side
+  row = 2.0 * (np.arange(rows)[:, None, None] + down) / rows - 1.0
+  column = 2.0 * (np.arange(columns)[:, None] + across) / columns - 1.0
+  where = np.stack(np.broadcast_arrays(row, column), axis=-1).reshape(-1, 2)
+  flat = _SHARPNESS * scores.reshape(*batch, rows * columns * parts, channels)
+  share = nn.softmax(flat, axis=-2)
+  points = jnp.einsum("...pc,pd->...cd", share, where.astype(np.float32))
+  return points.reshape(*batch, 2 * channels)
 
 
 def robot_inputs(robot: Array) -> Array:

@@ -161,6 +161,8 @@ def make_networks(
       config.feature_dim,
       (config.patch_channels, config.conv_channels),
       config.conv_overlap,
+      config.global_features,
+      config.wrist_features,
     ),
     "ap": Head(hidden, NUM_PRIMITIVES * ACTION_DIM),
     "bp": Head(hidden, NUM_PRIMITIVES * mixture_size(own_mean=learned_mean)),
