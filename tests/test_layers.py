@@ -21,7 +21,9 @@ LOOP = {
   "reporter",
   "train",
   "cli",
+  "commands",
   "options",
+  "resuming",
   "__main__",
 }
 """Modules that see both the world and the agent, or start those that do."""
