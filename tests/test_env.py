@@ -108,8 +108,8 @@ def test_pixels_show_the_task(env, pixel_chunk):
   red, green, blue = np.moveaxis(image, -1, 0)
   goal = (red > 1.8 * blue).sum((1, 2))
   plate = (blue > 2.5 * red).sum((1, 2))
-  assert (goal > 80).all() and (goal < 400).all()
-  assert (plate > 40).all() and (plate < 200).all()
+  assert (goal > 80).all() and (goal < 800).all()
+  assert (plate > 40).all() and (plate < 400).all()
   # What moves is seen to move.
   moved = np.abs(image - np.asarray(observation.global_image[-1], int)).max(-1)
   assert ((moved > 20).sum((1, 2)) > 30).all()
