@@ -1,4 +1,4 @@
-"""Put a plate from its holder into a box, from pixels: the agent of push_plate."""
+"""Put a plate from its holder into a box, from pixels: the agent of stack_box."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import dataclasses
 
 from apnpql_jax.presets import load_preset
 
-_PUSH = load_preset("push_plate")
+_STACK = load_preset("stack_box")
 
 CONFIG = dataclasses.replace(
-  _PUSH, env=dataclasses.replace(_PUSH.env, task="place_plate"), total_steps=102_400
+  _STACK, env=dataclasses.replace(_STACK.env, task="place_plate")
 )

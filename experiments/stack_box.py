@@ -1,4 +1,7 @@
-"""Stack the yellow box on the blue one, from pixels: the agent of push_plate."""
+"""Stack the yellow box on the blue one, from pixels.
+
+What differs from push_plate a grasp asks for: `experiments/log.md` has the trials.
+"""
 
 from __future__ import annotations
 
@@ -9,5 +12,11 @@ from apnpql_jax.presets import load_preset
 _PUSH = load_preset("push_plate")
 
 CONFIG = dataclasses.replace(
-  _PUSH, env=dataclasses.replace(_PUSH.env, task="stack_box"), total_steps=102_400
+  _PUSH,
+  env=dataclasses.replace(_PUSH.env, task="stack_box"),
+  agent=dataclasses.replace(
+    _PUSH.agent, min_prob=0.02, global_features="keypoints", wrist_features="both"
+  ),
+  replay=dataclasses.replace(_PUSH.replay, capacity=51_200, expert_steps=25_600),
+  total_steps=102_400,
 )
