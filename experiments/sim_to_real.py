@@ -1,7 +1,7 @@
 """Put a plate into a box in randomised worlds (paper Sec. V-C).
 
-The agent of place_plate, with larger images, as the paper has for its transfer to a real
-robot, and a shadow.
+The agent of place_plate, with larger images, as the paper has for its transfer to a
+real robot, and a shadow.
 """
 
 from __future__ import annotations
