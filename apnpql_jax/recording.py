@@ -1,4 +1,4 @@
-"""Videos of episodes: a larger view beside what both cameras see."""
+"""Videos of episodes: the whole robot beside what both cameras see."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from apnpql_jax.types import Array
 
 EPISODES = 4
 VIEW_SIZE = (292, 388)
-"""Height and width of the larger view in pixels; both cameras fit beside it, the global
+"""Height and width of the view of the robot in pixels; both cameras fit beside it, the global
 one doubled and that on the wrist enlarged four times."""
 
 HOLD = 4
@@ -49,7 +49,7 @@ def film(env: Env, policy: Policy) -> list[np.ndarray]:
     jax.random.key(0)
   )
   sizes = (
-    ("global", VIEW_SIZE),
+    ("wide", VIEW_SIZE),
     ("global", env.config.global_size),
     ("wrist", env.config.wrist_size),
   )

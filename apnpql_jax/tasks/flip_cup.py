@@ -35,7 +35,8 @@ from apnpql_jax.types import Array
 
 SHAPES = ((8, 0.030, 0.130), (8, 0.037, 0.140), (4, 0.033, 0.150))
 """Sides, half the width across them in m, height in m of the three cups. Taller than
-a mug: gripped in the middle, the gripper's 27 mm must clear the table twice."""
+a mug: gripped in the middle, the hand must clear the table by its 27 mm and, at the
+goal, by the 58 mm of the camera below it."""
 
 RANGE = ((0.48, 0.60), (-0.5, 0.5))
 """m and rad; distance from the base's axis and direction of cup and goal. Nearer to

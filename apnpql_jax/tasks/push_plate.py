@@ -37,7 +37,7 @@ GOAL_TOLERANCE = 0.03
 """m; the mark's radius exceeds the plate's by this much: solved = inside the mark."""
 
 HOVER_HEIGHT = 0.08
-"""m; tool height at which the finger tips clear the rim (34 mm) and the camera too."""
+"""m; tool height at which the finger tips clear the rim (34 mm)."""
 
 CLEAR = 0.05
 """m; above this the tool may travel without touching the rim."""

@@ -29,7 +29,7 @@ class TableTask:
       variants: see ``sim.scene.load_scene``.
     """
     self.scene = load_scene(
-      mjcf_path(self.name), cameras=("global", "wrist"), variants=variants
+      mjcf_path(self.name), cameras=("global", "wrist", "wide"), variants=variants
     )
     self._neutral_qpos = self.scene.keyframe("neutral")
     neutral = jnp.asarray(self._neutral_qpos[self.scene.arm_qpos], jnp.float32)
