@@ -16,8 +16,8 @@ from apnpql_jax.types import Array
 
 EPISODES = 4
 VIEW_SIZE = (292, 388)
-"""Height and width of the view of the robot in pixels; both cameras fit beside it, the global
-one doubled and that on the wrist enlarged four times."""
+"""Height and width of the view of the robot in pixels; both cameras fit beside it, the
+global one doubled and that on the wrist enlarged four times."""
 
 HOLD = 4
 """Frames for which the last instant of an episode stays, framed in green or red."""
