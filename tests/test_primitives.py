@@ -10,6 +10,8 @@ import pytest
 from apnpql_jax.primitives import bank, ik, tracking
 from apnpql_jax.sim import arm, physics
 from apnpql_jax.sim.kinematics import make_kinematics
+from apnpql_jax.tasks.stack_box import StackBox
+from apnpql_jax.tasks.task import ResetDraw
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +40,32 @@ def test_bank_targets_reach_their_poses(task, small_bank):
   np.testing.assert_allclose(reached, positions, atol=1e-3)
   angle = np.linalg.norm(arm.rotation_error(turned, rotations), axis=-1)
   assert angle.max() < ik.ROTATION_TOLERANCE
+
+
+class Careless(StackBox):
+  """A third of its draws have the boxes in each other, a third are out of reach."""
+
+  def sample_resets(self, rng: np.random.Generator, count: int) -> ResetDraw:
+    draw = super().sample_resets(rng, count)
+    (yellow, _), (blue, _) = map(self.scene.free_joint, ("yellow", "blue"))
+    place = draw.qpos[::3, blue : blue + 3] + [0.02, 0.0, 0.0]
+    draw.qpos[::3, yellow : yellow + 3] = place
+    draw.qpos[1::3, yellow] += 1.0
+    return draw
+
+
+def test_bank_rejects_what_overlaps_and_what_is_out_of_reach(capsys):
+  """Two rounds of 32 draws, of which 10 can be used in each."""
+  careless = Careless()
+  rows, report = bank.build_bank(careless, 16)
+  assert (report.drawn, rows.rows) == (64, 16)
+  assert (report.rejected_restless, report.rejected_unreachable) == (22, 22)
+  boxes = [careless.scene.free_joint(name)[0] for name in ("yellow", "blue")]
+  spots = np.stack([rows.qpos[:, address : address + 3] for address in boxes])
+  assert (np.linalg.norm(spots[0] - spots[1], axis=-1) > 0.12).all()
+  assert (spots[..., 0] < 0.6).all()
+  said = " ".join(capsys.readouterr().err.split())
+  assert "64 drawn, 22 of them restless and 22 out of reach" in said
 
 
 def test_refinement_agrees_with_mink(task, small_bank):

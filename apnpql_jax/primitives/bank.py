@@ -6,6 +6,7 @@ on every backend.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import concurrent.futures
 import dataclasses
 import hashlib
@@ -21,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 from flax import struct
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress
@@ -36,7 +38,7 @@ from apnpql_jax.types import Array
 if TYPE_CHECKING:  # Tasks know the primitives, so only the type may be known here.
   from apnpql_jax.tasks.task import Task
 
-VERSION = 2
+VERSION = 3
 """Raised when the meaning of a bank changes; part of the cache key."""
 
 SEED = 0
@@ -47,6 +49,8 @@ SETTLE_PERIODS = 4
 """Control periods of 0.15 s at rest before a draw is accepted."""
 SETTLE_SPEED = 0.05
 """m/s and rad/s; above float32 contact noise (0.04)."""
+SETTLE_SHIFT = 0.005
+"""m; what moves further while it settles has been drawn into something else."""
 
 MAX_TRAVEL = 2.5
 """rad; a joint that had to turn further would pass through another branch of the arm's
@@ -73,11 +77,19 @@ class BankReport:
   """How a bank came about."""
 
   drawn: int = 0
-  rejected_restless: int = 0
+  rejected_restless: int = 0  # moved away or still moving: they overlapped
   rejected_unreachable: int = 0
-  max_position_residual: float = 0.0  # m
+  max_position_residual: float = 0.0  # m, of mink
   max_rotation_residual: float = 0.0  # rad
   seconds: float = 0.0  # to build it
+
+  def __str__(self) -> str:
+    return (
+      f"{self.drawn:,} drawn, {self.rejected_restless:,} of them restless and "
+      f"{self.rejected_unreachable:,} out of reach; targets within "
+      f"{1e3 * self.max_position_residual:.2f} mm and "
+      f"{np.degrees(self.max_rotation_residual):.3f} degrees; {self.seconds:.0f} s"
+    )
 
 
 def load_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
@@ -95,7 +107,11 @@ def load_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
 
 
 def build_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
-  """Draws, settles and solves ``rows`` reset states, with a progress bar on stderr."""
+  """Draws, settles and solves ``rows`` reset states; progress and report on stderr.
+
+  Raises:
+    ConfigError: too many draws are rejected.
+  """
   began = time.monotonic()
   rng = np.random.default_rng(SEED)
   report = BankReport()
@@ -118,7 +134,8 @@ def build_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
         task, state, variant, pool, report, lambda n: progress.advance(bar, n)
       )
       kept.append(jax.tree.map(lambda x: x[:missing], solved))
-  report.seconds = time.monotonic() - began
+    report.seconds = time.monotonic() - began
+    progress.console.print(f"reset bank of {task.name}: {report}", highlight=False)
   return jax.tree.map(lambda *parts: jnp.concatenate(parts), *kept), report
 
 
@@ -133,13 +150,27 @@ def _settled(
   for _ in range(SETTLE_PERIODS):
     state = engine.step(state, jnp.zeros((count, 6)), closed.astype(jnp.float32))
   restless = np.abs(np.asarray(state.qvel)).max(-1) > SETTLE_SPEED
+  for address in _free_joints(task):
+    shift = np.asarray(state.qpos - draw.qpos)[:, address : address + 3]
+    restless |= np.linalg.norm(shift, axis=-1) > SETTLE_SHIFT
   report.drawn += count
   report.rejected_restless += int(restless.sum())
   return jax.tree.map(lambda x: x[~restless], (state, draw.variant))
 
 
+def _free_joints(task: Task) -> np.ndarray:
+  """i32[n]: where the positions of bodies that float freely begin in qpos."""
+  model = task.scene.model
+  return model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
+
+
 def _solve_targets(
-  task, state, variant, pool, report: BankReport, advance
+  task: Task,
+  state: physics.PhysicsState,
+  variant: Array,
+  pool: concurrent.futures.Executor,
+  report: BankReport,
+  advance: Callable[[int], None],
 ) -> ResetBank:
   kinematics = jax.jit(make_kinematics(task.scene))(state)
   positions, rotations, _ = map(np.asarray, task.tool_targets(state, kinematics))
