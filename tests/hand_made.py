@@ -1,10 +1,12 @@
-"""States made by hand: bodies, pads and tool put where a test wants them."""
+"""States made by hand, bodies, pads and tool put where a test wants them, and what
+tests ask of states that are drawn."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from apnpql_jax.sim import physics
@@ -70,3 +72,46 @@ def tool_at(task: Task, kinematics: Kinematics, where, mat=None) -> Kinematics:
   if mat is None:
     return kinematics
   return kinematics.replace(site_xmat=kinematics.site_xmat.at[:, tool].set(mat))
+
+
+def assert_uniform(values, low, high) -> None:
+  """Every column of ``values`` f64[n, ...] is uniform between ``low`` and ``high``."""
+  share = (values - low) / (np.asarray(high) - low)
+  assert share.min() >= 0 and share.max() <= 1
+  for column in share.reshape(len(share), -1).T:
+    assert stats.kstest(column, "uniform").pvalue > 1e-3
+
+
+def assert_arm_is_uniform(task: Task, qpos: np.ndarray) -> None:
+  """The arm of drawn states f64[n, nq] is around its neutral configuration."""
+  joints = task.scene.arm_qpos
+  arm = qpos[:, joints] - task.scene.keyframe("neutral")[joints]
+  assert_uniform(arm, -task.arm_noise, task.arm_noise)
+
+
+def assert_pairs_are_uniform(pairs, low, high, *, distance, least) -> None:
+  """Pairs f64[n, 4] are uniform where the spots of one are far enough apart.
+
+  Compared with pairs that are drawn here, as many as it takes.
+
+  Args:
+    pairs: two spots each, in any coordinates.
+    low: of the coordinates of a spot.
+    high: of the same.
+    distance: pairs -> f64[n], how far apart their spots are.
+    least: how far they have to be.
+  """
+  low, high = np.tile(np.stack([low, high]), 2)
+  assert (pairs >= low - 1e-9).all() and (pairs <= high + 1e-9).all()
+  assert least <= distance(pairs).min() < least + 0.01
+  drawn = np.random.default_rng(1).uniform(low, high, (40000, 4))
+  drawn = drawn[distance(drawn) >= least]
+  for actual, expected in zip(
+    (*pairs.T, distance(pairs)), (*drawn.T, distance(drawn)), strict=True
+  ):
+    assert stats.ks_2samp(actual, expected).pvalue > 1e-3
+
+
+def apart(pairs: np.ndarray) -> np.ndarray:
+  """Distances f64[n] between the spots x, y of pairs f64[n, 4]."""
+  return np.linalg.norm(pairs[:, :2] - pairs[:, 2:], axis=-1)

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from hand_made import put, tool_at
+from hand_made import (
+  assert_arm_is_uniform,
+  assert_pairs_are_uniform,
+  assert_uniform,
+  put,
+  tool_at,
+)
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +16,7 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
+from apnpql_jax.render import CameraSpec, Geoms, render
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.tasks import flip_cup, make_task
@@ -61,13 +68,21 @@ def test_resets_are_unsolved_and_in_range(task, resets, kinematics_of):
   assert not judge(task, resets, kinematics_of(resets)).any()
   address, _ = task.scene.free_joint("cup")
   qpos, mocap_pos, _, variant = task.sample_resets(np.random.default_rng(1), 3000)
+  assert_arm_is_uniform(task, qpos)
   cup, goal = qpos[:, address : address + 2], mocap_pos[:, 0, :2]
-  distance = np.linalg.norm(cup - goal, axis=-1)
-  assert flip_cup.MIN_DISTANCE <= distance.min() < flip_cup.MIN_DISTANCE + 0.01
+  polar = [
+    np.stack([np.linalg.norm(spot, axis=-1), np.arctan2(*spot.T[::-1])], axis=-1)
+    for spot in (cup, goal)
+  ]
+
+  def distance(pairs: np.ndarray) -> np.ndarray:
+    """By the law of cosines, of pairs of radius and direction."""
+    (a, b), turn = pairs[:, ::2].T, pairs[:, 1] - pairs[:, 3]
+    return np.sqrt(a**2 + b**2 - 2 * a * b * np.cos(turn))
+
   low, high = np.array(flip_cup.RANGE).T
-  for spot in (cup, goal):
-    polar = np.stack([np.linalg.norm(spot, axis=-1), np.arctan2(*spot.T[::-1])], -1)
-    assert (polar >= low - 1e-9).all() and (polar <= high + 1e-9).all()
+  least = flip_cup.MIN_DISTANCE
+  assert_pairs_are_uniform(np.hstack(polar), low, high, distance=distance, least=least)
   assert stats.chisquare(np.bincount(variant)).pvalue > 1e-3
   np.testing.assert_allclose(
     qpos[:, address + 2], np.array(flip_cup.SHAPES)[variant, 2] / 2
@@ -75,6 +90,34 @@ def test_resets_are_unsolved_and_in_range(task, resets, kinematics_of):
   quat = qpos[:, address + 3 : address + 7]
   axis = Rotation.from_quat(quat, scalar_first=True).as_matrix()[:, :, 2]
   np.testing.assert_allclose(axis, np.tile([0, 0, -1], (3000, 1)), atol=1e-9)
+  face = Rotation.from_quat(quat, scalar_first=True).as_matrix()[:, :, 0]
+  turn = np.arctan2(face[:, 1], face[:, 0]) - polar[0][:, 1]
+  assert_uniform(turn, -flip_cup.MAX_YAW, flip_cup.MAX_YAW)
+
+
+def test_the_small_image_shows_which_way_up_the_cup_is(
+  task, resets, half_heights, kinematics_of
+):
+  model = task.scene.model
+  camera = task.scene.id("camera", "global")
+  spec = CameraSpec.from_model(model, "global", height=72, width=96)
+
+  def mouth_pixels(state: physics.PhysicsState) -> np.ndarray:
+    kinematics = kinematics_of(state)
+    image = render(
+      Geoms.from_model(model),
+      spec,
+      kinematics.geom_xpos,
+      kinematics.geom_xmat,
+      kinematics.cam_xpos[:, camera],
+      kinematics.cam_xmat[:, camera],
+      fields=kinematics.fields,
+      outputs=("segmentation",),
+    )
+    return np.sum(image.segmentation == task.scene.id("geom", "mouth"), axis=(1, 2))
+
+  assert not mouth_pixels(resets).any()
+  assert mouth_pixels(on_goal(task, resets, half_heights)).min() >= 8
 
 
 def test_an_upright_cup_at_rest_on_the_goal_is_success(

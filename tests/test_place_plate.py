@@ -5,6 +5,10 @@ from __future__ import annotations
 import itertools
 
 from hand_made import (
+  apart,
+  assert_arm_is_uniform,
+  assert_pairs_are_uniform,
+  assert_uniform,
   drawn,
   neutral_tool,
   pos,
@@ -18,7 +22,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from apnpql_jax.sim import physics
@@ -121,13 +124,6 @@ def draw(task):
   return task.sample_resets(np.random.default_rng(0), 4000)
 
 
-def assert_uniform(values, low, high) -> None:
-  share = (values - low) / (np.asarray(high) - low)
-  assert share.min() >= 0 and share.max() <= 1
-  for column in share.reshape(len(share), -1).T:
-    assert stats.kstest(column, "uniform").pvalue > 1e-3
-
-
 def test_resets_are_unsolved(task, resets, kinematics):
   assert not task.success(resets, kinematics).any()
 
@@ -141,8 +137,7 @@ def test_turns_are_uniform_in_range(task, draw, body, limit):
 
 def test_the_arm_is_uniform_around_neutral(task, draw):
   scene = task.scene
-  arm = draw.qpos[:, scene.arm_qpos] - scene.keyframe("neutral")[scene.arm_qpos]
-  assert_uniform(arm, -task.arm_noise, task.arm_noise)
+  assert_arm_is_uniform(task, draw.qpos)
   fingers = draw.qpos[:, scene.gripper_qpos : scene.gripper_qpos + 4]
   np.testing.assert_array_equal(fingers, np.zeros((4000, 4)))
 
@@ -155,23 +150,12 @@ def test_what_is_drawn_is_independent(task, draw):
 
 
 def test_spots_are_uniform_among_pairs_that_are_far_apart(task, draw):
-  """By rejection of pairs, as often as it takes."""
   holder, goal = (mocap(task, draw, body)[0] for body in ("holder", "goal"))
   spots = np.concatenate([holder[:, :2], goal[:, :2]], axis=1)
-  low, high = np.tile(np.array(place_plate.WORKSPACE).T, 2)
-  assert (spots >= low).all() and (spots <= high).all()
   np.testing.assert_array_equal([holder[:, 2], goal[:, 2]], np.zeros((2, 4000)))
-
-  def distance(pairs):
-    return np.linalg.norm(pairs[:, :2] - pairs[:, 2:], axis=-1)[:, None]
-
-  nearest = distance(spots).min()
-  assert place_plate.MIN_DISTANCE <= nearest < place_plate.MIN_DISTANCE + 0.002
-  pairs = np.random.default_rng(1).uniform(low, high, (40000, 4))
-  pairs = pairs[distance(pairs)[:, 0] >= place_plate.MIN_DISTANCE]
-  actual, expected = (np.hstack([x, distance(x)]) for x in (spots, pairs))
-  for column in range(5):
-    assert stats.ks_2samp(actual[:, column], expected[:, column]).pvalue > 1e-3
+  low, high = np.array(place_plate.WORKSPACE).T
+  least = place_plate.MIN_DISTANCE
+  assert_pairs_are_uniform(spots, low, high, distance=apart, least=least)
 
 
 def test_the_plate_stands_in_the_middle_of_its_holder(task, draw):

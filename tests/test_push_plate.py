@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hand_made import apart, assert_arm_is_uniform, assert_pairs_are_uniform
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,16 +38,11 @@ def test_resets_are_unsolved_and_in_range(task, resets):
   assert not judge(task, resets).any()
   plate, _ = task.scene.free_joint("plate")
   qpos, mocap_pos, *_ = task.sample_resets(np.random.default_rng(0), 2000)
-  spots = np.stack([qpos[:, plate : plate + 2], mocap_pos[:, 0, :2]])
+  assert_arm_is_uniform(task, qpos)
+  spots = np.hstack([qpos[:, plate : plate + 2], mocap_pos[:, 0, :2]])
   low, high = np.array(push_plate.WORKSPACE).T
-  assert (spots >= low).all() and (spots <= high).all()
-  distance = np.linalg.norm(spots[0] - spots[1], axis=-1)
-  assert distance.min() >= push_plate.MIN_DISTANCE
-  # Uniform: the quartiles of a uniform range, up to sampling noise.
-  share = (spots[0] - low) / (high - low)
-  np.testing.assert_allclose(
-    np.quantile(share, [0.25, 0.5, 0.75], axis=0).mean(1), [0.25, 0.5, 0.75], atol=0.03
-  )
+  least = push_plate.MIN_DISTANCE
+  assert_pairs_are_uniform(spots, low, high, distance=apart, least=least)
 
 
 def test_plate_at_rest_on_the_goal_is_success(task, solved):

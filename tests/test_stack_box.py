@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from hand_made import (
+  apart,
+  assert_arm_is_uniform,
+  assert_pairs_are_uniform,
+  assert_uniform,
   drawn,
   neutral_tool,
   pos,
@@ -16,7 +20,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from apnpql_jax.sim import physics
@@ -87,28 +90,16 @@ def draw(task):
   return task.sample_resets(np.random.default_rng(0), 4000)
 
 
-def share(values, low, high):
-  return (values - low) / (np.asarray(high) - low)
-
-
-def assert_uniform(shares) -> None:
-  assert shares.min() >= 0 and shares.max() <= 1
-  for column in shares.reshape(len(shares), -1).T:
-    assert stats.kstest(column, "uniform").pvalue > 1e-3
-
-
 def test_resets_are_unsolved(task, resets, kinematics):
   assert not task.success(resets, kinematics).any()
 
 
 def test_resets_are_uniform_in_range(task, draw):
-  scene = task.scene
-  arm = draw.qpos[:, scene.arm_qpos] - scene.keyframe("neutral")[scene.arm_qpos]
-  assert_uniform(share(arm, -task.arm_noise, task.arm_noise))
+  assert_arm_is_uniform(task, draw.qpos)
   for body in ("yellow", "blue"):
     turn = rotation(task, draw, body).as_rotvec()
     np.testing.assert_allclose(turn[:, :2], 0, atol=1e-12)
-    assert_uniform(share(turn[:, 2], -stack_box.MAX_YAW, stack_box.MAX_YAW))
+    assert_uniform(turn[:, 2], -stack_box.MAX_YAW, stack_box.MAX_YAW)
 
 
 def test_what_is_drawn_is_independent(task, draw):
@@ -119,23 +110,12 @@ def test_what_is_drawn_is_independent(task, draw):
 
 
 def test_the_pair_is_uniform_where_it_may_be(task, draw):
-  """By rejection of pairs drawn here."""
   spots = np.hstack(
     [draw.qpos[:, a : a + 2] for a, _ in map(task.scene.free_joint, ("yellow", "blue"))]
   )
-  low, high = np.tile(np.array(stack_box.WORKSPACE).T, 2)
-  assert (spots >= low).all() and (spots <= high).all()
-
-  def distance(pairs):
-    return np.linalg.norm(pairs[:, :2] - pairs[:, 2:], axis=-1)[:, None]
-
-  nearest = distance(spots).min()
-  assert stack_box.MIN_DISTANCE <= nearest < stack_box.MIN_DISTANCE + 0.01
-  pairs = np.random.default_rng(1).uniform(low, high, (40000, 4))
-  pairs = pairs[distance(pairs)[:, 0] >= stack_box.MIN_DISTANCE]
-  actual, expected = (np.hstack([x, distance(x)]) for x in (spots, pairs))
-  for column in range(5):
-    assert stats.ks_2samp(actual[:, column], expected[:, column]).pvalue > 1e-3
+  low, high = np.array(stack_box.WORKSPACE).T
+  least = stack_box.MIN_DISTANCE
+  assert_pairs_are_uniform(spots, low, high, distance=apart, least=least)
 
 
 def test_the_rest_of_a_reset_is_the_keyframe(task, draw):
@@ -336,9 +316,11 @@ def test_a_low_tool_that_is_away_rises(
     np.testing.assert_allclose(positions[:, row, 2], stack_box.TRAVEL, rtol=1e-6)
 
 
-def test_an_empty_hand_goes_above_the_goal(task, resets, kinematics):
+def test_an_empty_hand_goes_above_the_goal(task, resets, kinematics, neutral):
   high = tool_at(task, kinematics, jnp.array([0.5, 0.0, 0.3]))
-  positions, *_ = task.tool_targets(resets, high)
+  positions, rotations, _ = task.tool_targets(resets, high)
+  straight = np.broadcast_to(neutral[1], (WORLDS, 3, 3))
+  np.testing.assert_allclose(rotations[:, 1], straight, atol=1e-5)
   blue = pos(task, resets, "blue")
   expected = blue.at[:, 2].set(stack_box.TRAVEL)
   np.testing.assert_allclose(positions[:, 1], expected, atol=1e-6)
