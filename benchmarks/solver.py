@@ -25,6 +25,7 @@ from apnpql_jax.rollout import expert_policy
 from apnpql_jax.tasks import make_task, task_names
 
 RESULT = Path(__file__).resolve().parent / "results" / "solver.json"
+SETTINGS = ["20x20", "8x20", "8x15", "20x10", "10x10", "5x20"]
 
 
 def main() -> None:
@@ -32,9 +33,7 @@ def main() -> None:
   parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
   parser.add_argument("--tasks", nargs="+", choices=task_names(), default=task_names())
   parser.add_argument("--backend", choices=["native", "mjx"], default="mjx")
-  parser.add_argument(
-    "--settings", nargs="+", default=["20x20", "10x10", "6x8", "4x6", "3x4"]
-  )
+  parser.add_argument("--settings", nargs="+", default=SETTINGS)
   parser.add_argument("--episodes", type=int, default=64)
   args = parser.parse_args()
   RESULT.parent.mkdir(exist_ok=True)
