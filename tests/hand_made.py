@@ -14,6 +14,7 @@ from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.tasks import Task
 from apnpql_jax.tasks.pinch import finger_angle
+from apnpql_jax.tasks.table import TableTask
 
 
 def drawn(task: Task, worlds: int, *, seed: int = 3) -> PhysicsState:
@@ -82,7 +83,7 @@ def assert_uniform(values, low, high) -> None:
     assert stats.kstest(column, "uniform").pvalue > 1e-3
 
 
-def assert_arm_is_uniform(task: Task, qpos: np.ndarray) -> None:
+def assert_arm_is_uniform(task: TableTask, qpos: np.ndarray) -> None:
   """The arm of drawn states f64[n, nq] is around its neutral configuration."""
   joints = task.scene.arm_qpos
   arm = qpos[:, joints] - task.scene.keyframe("neutral")[joints]
