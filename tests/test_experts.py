@@ -64,7 +64,7 @@ def play(env, disturb: Callable[[int, PhysicsState], PhysicsState]) -> int:
 
 
 def test_the_expert_recovers_when_the_object_is_pushed_away(env):
-  """It is moved aside while the arm approaches, further than the goal's tolerance."""
+  """It is moved aside while the arm approaches."""
   if env.task.name not in PUSHED:
     pytest.skip("a holder is in the way, or a task of your own")
   body, far = PUSHED[env.task.name]

@@ -391,10 +391,14 @@ def test_same_pixels_alone_batched_and_inside_transformations(world):
     jax.tree.map(lambda *x: jnp.stack(x), *alone),
     view(*world.poses),
   )
+  capsules = world.model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE
+  grazed = np.isin(batched.segmentation, np.flatnonzero(capsules))
   for other in others:
     np.testing.assert_array_equal(other.segmentation, batched.segmentation)
-    # Rays that graze an ellipsoid magnify rounding.
-    np.testing.assert_allclose(other.depth, batched.depth, rtol=5e-5)
+    depths = np.asarray(other.depth), np.asarray(batched.depth)
+    np.testing.assert_allclose(*(x[~grazed] for x in depths), rtol=1e-5)
+    # Rays that graze a capsule magnify rounding: 3e-5 on 10 pixels of 60,000.
+    np.testing.assert_allclose(*(x[grazed] for x in depths), rtol=5e-5)
     difference = np.abs(
       np.asarray(other.rgb, np.int32) - np.asarray(batched.rgb, np.int32)
     )
