@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 import json
 import os
 from pathlib import Path
+import subprocess
 from typing import Any
 
 import jax
@@ -17,8 +18,12 @@ PERFORMANCE = ROOT / "docs" / "performance.md"
 
 
 def machine() -> dict[str, Any]:
-  """What a figure was measured with."""
+  """What a figure was measured with; the commit is empty outside a checkout."""
+  commit = subprocess.run(
+    ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True
+  )
   return {
+    "commit": commit.stdout.strip(),
     "device": jax.devices()[0].device_kind,
     "cores": len(os.sched_getaffinity(0)),
     "versions": {module.__name__: module.__version__ for module in (jax, mujoco)},
@@ -27,8 +32,9 @@ def machine() -> dict[str, Any]:
 
 def store(name: str, report: dict[str, Any]) -> None:
   """Writes ``benchmarks/results/<name>.json``."""
-  RESULTS.mkdir(parents=True, exist_ok=True)
-  (RESULTS / f"{name}.json").write_text(json.dumps(report, indent=2) + "\n")
+  path = RESULTS / f"{name}.json"
+  path.parent.mkdir(parents=True, exist_ok=True)
+  path.write_text(json.dumps(report, indent=2) + "\n")
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:

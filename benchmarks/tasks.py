@@ -12,15 +12,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-from pathlib import Path
 import time
 
 import apnpql_jax  # noqa: F401  isort: skip  (before JAX: sets threads and cache)
 import imageio.v3 as iio
-import jax
-import mujoco
 import numpy as np
+import tables
 
 from apnpql_jax.config import EnvConfig
 from apnpql_jax.contact_report import contact_report
@@ -31,11 +28,29 @@ from apnpql_jax.recording import film, record_episodes
 from apnpql_jax.rollout import expert_policy
 from apnpql_jax.tasks import make_task, task_names
 
-ROOT = Path(__file__).resolve().parents[1]
-RESULTS = ROOT / "benchmarks" / "results" / "tasks"
-DOC = ROOT / "docs" / "tasks.md"
+RESULTS = tables.RESULTS / "tasks"
+DOC = tables.ROOT / "docs" / "tasks.md"
 INSTANTS = 4
 """Instants of an episode in a picture."""
+EXPERTS_HEAD = (
+  "task",
+  "backend",
+  "solved",
+  "rate (95 %)",
+  "periods",
+  "pairs",
+  "contact slots",
+  "rows",
+  "physics steps/s",
+)
+BANKS_HEAD = (
+  "bank of resets",
+  "rows",
+  "draws rejected",
+  "residual of mink",
+  "built in",
+  "loaded in",
+)
 
 
 def main() -> None:
@@ -48,7 +63,6 @@ def main() -> None:
   parser.add_argument("--episodes", type=int, default=512)
   parser.add_argument("--seed", type=int, default=0)
   args = parser.parse_args()
-  RESULTS.mkdir(parents=True, exist_ok=True)
   # Speeds first: episodes take so long that something else will run beside them.
   reports = {}
   for name in args.tasks:
@@ -58,9 +72,10 @@ def main() -> None:
     for backend in args.backends:
       config = EnvConfig(task=name, backend=backend, obs="state")
       measured = measure(config, report, episodes=args.episodes, seed=args.seed)
-      path = RESULTS / f"{name}-{backend}.json"
-      path.write_text(json.dumps(measured, indent=2) + "\n")
-      print(path.name, measured["successes"], "of", measured["episodes"], flush=True)
+      tables.store(f"tasks/{name}-{backend}", measured)
+      print(
+        name, backend, measured["successes"], "of", measured["episodes"], flush=True
+      )
     show(make_env(EnvConfig(task=name, backend="native", obs="state")))
   write_table()
 
@@ -78,16 +93,14 @@ def measure(
     **figures,
     "contacts": contacts,
     "bank": {"rows": bank.rows, "load_seconds": load_seconds, **vars(report)},
-    "device": jax.devices()[0].device_kind,
-    "cores": len(os.sched_getaffinity(0)),
-    "versions": {module.__name__: module.__version__ for module in (jax, mujoco)},
+    **tables.machine(),
   }
 
 
 def show(env: Env) -> None:
   """The expert's picture and video."""
   policy = expert_policy(env, noise=0.0)
-  folder = ROOT / "docs" / "tasks"
+  folder = tables.ROOT / "docs" / "tasks"
   record_episodes(env, policy, folder / f"{env.task.name}.mp4")
   episode = film(env, policy)[0]
   chosen = np.linspace(0, len(episode) - 1, INSTANTS).round().astype(int)
@@ -99,48 +112,39 @@ def write_table() -> None:
   """Puts the tables of all results at hand between the marks in docs/tasks.md."""
   results = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))]
   banks = {result["task"]: result["bank"] for result in results}
-  table = "\n".join(
-    [
-      "| task | backend | solved | rate (95 %) | periods | pairs | contact slots "
-      "| rows | physics steps/s |",
-      "|---" * 9 + "|",
-      *map(episodes_row, results),
-      "",
-      "| bank of resets | rows | draws rejected | residual of mink | built in "
-      "| loaded in |",
-      "|---" * 6 + "|",
-      *(bank_row(task, bank) for task, bank in banks.items()),
-    ]
+  tables.put("experts", tables.table(EXPERTS_HEAD, map(expert_row, results)), DOC)
+  tables.put(
+    "banks", tables.table(BANKS_HEAD, map(bank_row, banks, banks.values())), DOC
   )
-  text = DOC.read_text()
-  before, _, rest = text.partition("<!-- table -->")
-  _, _, after = rest.partition("<!-- end -->")
-  DOC.write_text(f"{before}<!-- table -->\n{table}\n<!-- end -->{after}")
 
 
-def episodes_row(result: dict) -> str:
+def expert_row(result: dict) -> list[object]:
   """How the expert did and what the scene costs, on one engine."""
   low, high = result["ci95"]
   contacts = result["contacts"]
-  return (
-    f"| {result['task']} | {result['backend']} "
-    f"| {result['successes']} of {result['episodes']} "
-    f"| {100 * result['success_rate']:.1f} % ({100 * low:.1f} to {100 * high:.1f}) "
-    f"| {result['mean_length']:.1f} | {contacts['pairs']} | {contacts['contacts']} "
-    f"| {contacts['constraint_rows']} "
-    f"| {contacts[result['backend'] + '_steps_per_s']:,.0f} |"
-  )
+  return [
+    result["task"],
+    result["backend"],
+    f"{result['successes']} of {result['episodes']}",
+    f"{100 * result['success_rate']:.1f} % ({100 * low:.1f} to {100 * high:.1f})",
+    result["mean_length"],
+    *(contacts[key] for key in ("pairs", "contacts", "constraint_rows")),
+    contacts[result["backend"] + "_steps_per_s"],
+  ]
 
 
-def bank_row(task: str, bank: dict) -> str:
+def bank_row(task: str, bank: dict) -> list[object]:
   """How the reset states came about."""
   rejected = bank["rejected_restless"] + bank["rejected_unreachable"]
-  return (
-    f"| {task} | {bank['rows']:,} | {rejected} of {bank['drawn']:,} "
-    f"| {1e3 * bank['max_position_residual']:.2f} mm, "
-    f"{np.degrees(bank['max_rotation_residual']):.3f} degrees "
-    f"| {bank['seconds']:.0f} s | {bank['load_seconds']:.2f} s |"
-  )
+  return [
+    task,
+    f"{bank['rows']:,}",
+    f"{rejected} of {bank['drawn']:,}",
+    f"{1e3 * bank['max_position_residual']:.2f} mm, "
+    f"{np.degrees(bank['max_rotation_residual']):.3f} degrees",
+    f"{bank['seconds']:.0f} s",
+    f"{bank['load_seconds']:.2f} s",
+  ]
 
 
 if __name__ == "__main__":
