@@ -58,7 +58,7 @@ class Reporter:
     """Plays held-out episodes, writes their row, the curve and, at last, a video."""
     began = time.monotonic()
     config, folder = self._config, self.folder
-    params = state.learner.params
+    params = state.learner.target_params
     figures = play_held_out(
       self._env, self._play, params, episodes=config.eval_episodes, seed=EVAL_SEED
     )

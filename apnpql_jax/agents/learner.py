@@ -25,7 +25,7 @@ class LearnerState(struct.PyTreeNode):
   """All that the learner needs to go on."""
 
   params: Params  # one entry per group that the algorithm has
-  target_params: Params  # slow average of params
+  target_params: Params  # slow average of params, which also is what acts
   nu: Array  # f32[] >= 0: multiplier of the entropy floor
   opt_state: Any  # of one Adam per learning rate
   step: Array  # i32[]: updates done
