@@ -170,12 +170,11 @@ def test_the_plate_stands_in_the_middle_of_its_holder(task, draw):
   np.testing.assert_allclose(axis, np.tile([1, 0, 0], (4000, 1)), atol=1e-6)
 
 
-def test_nothing_touches_but_the_plate_the_table(task, draw):
+def test_the_plate_touches_neither_jaws_nor_walls(task, draw):
   model = task.scene.model
   data = mujoco.MjData(model)
   jaws = ("jaw_0", "jaw_1")
   walls = [f"wall_{i}" for i in range(4)]
-  robot = ("r_tip", "l_tip", "hand", "d435")
 
   def nearest(ones, others):
     pairs = itertools.product(ones, others)
@@ -185,12 +184,10 @@ def test_nothing_touches_but_the_plate_the_table(task, draw):
   for qpos, mocap_pos, mocap_quat, *_ in zip(*(x[:100] for x in draw), strict=True):
     data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = qpos, mocap_pos, mocap_quat
     mujoco.mj_forward(model, data)
-    assert (np.abs(data.contact.dist) < 1e-5).all()
     # Two millimetres on both sides.
     for jaw in jaws:
       assert nearest([jaw], ["plate"]) == pytest.approx(0.002, abs=1e-5)
     assert nearest(walls, ["plate", *jaws]) > 0
-    assert nearest(robot, ["table", "plate", *jaws, *walls]) > 0.02
 
 
 def test_a_reset_is_at_rest(task, resets, step):
