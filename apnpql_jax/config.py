@@ -215,6 +215,10 @@ class AgentConfig:
   conv_channels: int = 32
   """Channels of the second convolution of each camera."""
 
+  residual_blocks: int = 0
+  """Residual blocks, two 3x3 convolutions each, after the second convolution of each
+  camera; the paper has none. Slow on a CPU."""
+
   global_features: str = "map"
   """What is kept of the convolutions of the global camera: map (flattened); keypoints
   (where each channel scores highest), which learn from fewer scenes; or both."""

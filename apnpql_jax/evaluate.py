@@ -133,7 +133,9 @@ def evaluate_run(
     print(line, file=sys.stderr)
   learner = found.items["learner"]
   play = make_player(env, lambda params: agent_policy(agent, params, greedy=False))
-  figures = play_held_out(env, play, learner.target_params, episodes=episodes, seed=seed)
+  figures = play_held_out(
+    env, play, learner.target_params, episodes=episodes, seed=seed
+  )
   return {
     "task": config.env.task,
     "algorithm": config.agent.algorithm,

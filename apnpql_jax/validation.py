@@ -62,8 +62,8 @@ _POSITIVE = (
 ).split()
 _NOT_NEGATIVE = (
   "agent.learning_rate_m agent.learning_rate_alpha agent.learning_rate_nu "
-  "agent.lambda_ap agent.m_step_delay replay.expert_steps replay.expert_noise seed "
-  "save_replay_every"
+  "agent.lambda_ap agent.m_step_delay agent.residual_blocks replay.expert_steps "
+  "replay.expert_noise seed save_replay_every"
 ).split()
 
 _AT_MOST = {"env.bank_rows": 1 << 20, "agent.num_atoms": 10_000}

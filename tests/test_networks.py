@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import special
+from scipy import ndimage, special
 
 from apnpql_jax.agents import encoder
 from apnpql_jax.agents.evaluation import Categorical
@@ -76,6 +77,41 @@ def test_pixel_encoder_is_two_convolutions(shape: tuple[int, int], overlap: bool
   np.testing.assert_allclose(flat, expected, rtol=1e-4, atol=1e-5)
   expected = np.concatenate([expected_positions(x) for x in (first, second)], axis=-1)
   np.testing.assert_allclose(points, expected, atol=1e-4)
+
+
+def test_residual_blocks_start_as_the_identity_and_add_convolutions():
+  rng = np.random.default_rng(0)
+  image = jnp.asarray(rng.integers(0, 256, (2, 36, 64, 3)), jnp.uint8)
+  plain = encoder.PixelEncoder((5, 6), overlap=True)
+  deep = encoder.PixelEncoder((5, 6), overlap=True, residual_blocks=2)
+  params = deep.init(jax.random.key(0), image)["params"]
+  one = {name: params[name] for name in ("patches", "conv")}
+  jax.tree.map(
+    np.testing.assert_array_equal,
+    deep.apply({"params": params}, image),
+    plain.apply({"params": one}, image),
+  )
+
+  block = encoder.ResidualBlock(6)
+  x = rng.normal(size=(2, 5, 7, 6)).astype(np.float32)
+  params = block.init(jax.random.key(0), x)["params"]
+  params = jax.tree.map(lambda p: rng.normal(size=p.shape).astype(np.float32), params)
+  expected = x.astype(np.float64)
+  y = expected
+  for layer in ("first", "second"):
+    y = same_convolution(np.maximum(y, 0.0), **params[layer])
+  actual = block.apply({"params": params}, x)
+  np.testing.assert_allclose(actual, expected + y, rtol=1e-4, atol=1e-3)
+
+
+def same_convolution(x: np.ndarray, kernel: np.ndarray, bias: np.ndarray) -> np.ndarray:
+  """3x3 with stride 1 and zero padding, by scipy: f64[b, H, W, C] -> [b, H, W, D]."""
+  y = np.zeros((*x.shape[:3], kernel.shape[-1])) + bias
+  for one, (c, d) in itertools.product(range(len(x)), np.ndindex(kernel.shape[2:])):
+    y[one, ..., d] += ndimage.correlate(
+      x[one, ..., c], kernel[..., c, d], mode="constant"
+    )
+  return y
 
 
 def expected_positions(scores: jax.Array) -> np.ndarray:

@@ -27,7 +27,7 @@ _SHARPNESS = 4.0
 
 
 class PixelEncoder(nn.Module):
-  """Two convolution layers for one camera.
+  """Two convolution layers for one camera, and residual blocks if there shall be any.
 
   A 4x4 convolution with stride 4, then a 3x3 one with stride 2 (or 2x2 without
   overlap), both written as matrix products: XLA:CPU runs a convolution inside a scan,
@@ -37,6 +37,7 @@ class PixelEncoder(nn.Module):
 
   channels: Sequence[int]
   overlap: bool
+  residual_blocks: int = 0
 
   @nn.compact
   def __call__(self, image: Array) -> tuple[Array, Array]:
@@ -54,8 +55,25 @@ class PixelEncoder(nn.Module):
     else:
       x = cells.reshape(*cells.shape[:-2], -1)
     x = nn.Dense(second, name="conv")(x)
+    for i in range(self.residual_blocks):
+      x = ResidualBlock(second, name=f"block_{i}")(x)
     points = jnp.concatenate([keypoints(patches), keypoints(x[..., None, :])], axis=-1)
     return nn.relu(x).reshape(*image.shape[:-3], -1), points
+
+
+class ResidualBlock(nn.Module):
+  """f32[*b, H, W, C] -> the same plus two 3x3 convolutions, relu before each (He et
+  al. 2016b). Starts as the identity."""
+
+  channels: int
+
+  @nn.compact
+  def __call__(self, x: Array) -> Array:
+    y = nn.Conv(self.channels, (3, 3), name="first")(nn.relu(x))
+    y = nn.Conv(
+      self.channels, (3, 3), name="second", kernel_init=nn.initializers.zeros
+    )(nn.relu(y))
+    return x + y
 
 
 class Encoder(nn.Module):
@@ -71,6 +89,7 @@ class Encoder(nn.Module):
   feature_dim: int
   channels: Sequence[int]
   overlap: bool
+  residual_blocks: int
   global_features: str
   wrist_features: str
 
@@ -87,7 +106,10 @@ class Encoder(nn.Module):
     for name, kind in kinds.items():
       image = getattr(observation, name)
       if image is not None:
-        pixels, points = PixelEncoder(self.channels, self.overlap, name=name)(image)
+        look = PixelEncoder(
+          self.channels, self.overlap, self.residual_blocks, name=name
+        )
+        pixels, points = look(image)
         if kind != "map":
           state.append(points)
         if kind != "keypoints":

@@ -161,6 +161,7 @@ def make_networks(
       config.feature_dim,
       (config.patch_channels, config.conv_channels),
       config.conv_overlap,
+      config.residual_blocks,
       config.global_features,
       config.wrist_features,
     ),
