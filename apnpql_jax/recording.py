@@ -15,9 +15,9 @@ from apnpql_jax.rollout import Policy
 from apnpql_jax.types import Array
 
 EPISODES = 4
-VIEW_SIZE = (292, 388)
+VIEW_SIZE = (506, 674)
 """Height and width of the view of the robot in pixels; both cameras fit beside it, the
-global one doubled and that on the wrist enlarged four times."""
+global one enlarged four times and that on the wrist six times."""
 
 HOLD = 4
 """Frames for which the last instant of an episode stays, framed in green or red."""

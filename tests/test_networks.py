@@ -101,7 +101,7 @@ def test_residual_blocks_start_as_the_identity_and_add_convolutions():
   for layer in ("first", "second"):
     y = same_convolution(np.maximum(y, 0.0), **params[layer])
   actual = block.apply({"params": params}, x)
-  np.testing.assert_allclose(actual, expected + y, rtol=1e-4, atol=1e-3)
+  np.testing.assert_allclose(np.asarray(actual), expected + y, rtol=1e-4, atol=1e-3)
 
 
 def same_convolution(x: np.ndarray, kernel: np.ndarray, bias: np.ndarray) -> np.ndarray:

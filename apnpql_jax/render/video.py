@@ -18,8 +18,8 @@ _MACROBLOCK = 16  # common video codecs want sides that are multiples of it
 def tile(views: Sequence[np.ndarray], *, gap: int = 2) -> np.ndarray:
   """Puts a large view on the left and the others in a column to its right.
 
-  The others are enlarged by whole factors, nearest neighbour, so that each fills its
-  share of the large view's height as far as it fits; what remains is black.
+  The others are enlarged by whole factors, nearest neighbour, to about the same width,
+  as far as the large view's height has room for them; what remains is black.
 
   Args:
     views: u8[T, H_i, W_i, 3], the large view first.
@@ -41,10 +41,13 @@ def tile(views: Sequence[np.ndarray], *, gap: int = 2) -> np.ndarray:
   if not others:
     return large.copy()
   frames, height = large.shape[:2]
-  share = (height - gap * (len(others) - 1)) // len(others)
-  enlarged = [enlarge(v, max(1, share // v.shape[1])) for v in others]
+  for factor in range(max(1, height // others[0].shape[1]), 0, -1):
+    width = factor * others[0].shape[2]
+    enlarged = [enlarge(v, max(1, round(width / v.shape[2]))) for v in others]
+    needed = sum(v.shape[1] for v in enlarged) + gap * (len(others) - 1)
+    if needed <= height:
+      break
   width = max(v.shape[2] for v in enlarged)
-  needed = sum(v.shape[1] for v in enlarged) + gap * (len(others) - 1)
   out = np.zeros(
     (frames, max(height, needed), large.shape[2] + gap + width, 3), np.uint8
   )
