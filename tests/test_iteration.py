@@ -148,6 +148,18 @@ def test_the_state_keeps_its_types_so_that_one_compilation_serves_every_iteratio
   assert types(start) == types(after)
 
 
+def test_the_slow_average_of_the_weights_acts(iteration, state):
+  """Which worlds come about depends on it, and not on the weights that are trained."""
+
+  def worlds(**learner: Any) -> list[bytes]:
+    moved = state.replace(learner=state.learner.replace(**learner))
+    return _bits(iteration(moved)[0].env)
+
+  other = jax.tree.map(lambda x: x + 0.01, state.learner.params)
+  assert worlds(params=other) == worlds()
+  assert worlds(target_params=other) != worlds()
+
+
 def test_an_iteration_is_a_function_of_its_state(iteration, state):
   first, again = iteration(state), iteration(state)
   assert _bits(first) == _bits(again)
