@@ -15,8 +15,12 @@ CONFIG = dataclasses.replace(
   _PUSH,
   env=dataclasses.replace(_PUSH.env, task="stack_box"),
   agent=dataclasses.replace(
-    _PUSH.agent, min_prob=0.02, global_features="keypoints", wrist_features="both"
+    _PUSH.agent,
+    min_prob=0.02,
+    target_rate=0.01,
+    global_features="keypoints",
+    wrist_features="both",
   ),
   replay=dataclasses.replace(_PUSH.replay, capacity=51_200, expert_steps=25_600),
-  total_steps=102_400,
+  total_steps=61_440,
 )
