@@ -21,6 +21,9 @@ CONFIG = TrainConfig(
     m_step_delay=500,
     lambda_ap=30.0,
     conv_overlap=False,
+    target_rate=0.01,
+    global_features="keypoints",
+    wrist_features="both",
   ),
   replay=ReplayConfig(
     capacity=25_600, expert_steps=6_400, expert_share=0.5, batch_size=64

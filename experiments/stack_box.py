@@ -14,13 +14,7 @@ _PUSH = load_preset("push_plate")
 CONFIG = dataclasses.replace(
   _PUSH,
   env=dataclasses.replace(_PUSH.env, task="stack_box"),
-  agent=dataclasses.replace(
-    _PUSH.agent,
-    min_prob=0.02,
-    target_rate=0.01,
-    global_features="keypoints",
-    wrist_features="both",
-  ),
+  agent=dataclasses.replace(_PUSH.agent, min_prob=0.02),
   replay=dataclasses.replace(_PUSH.replay, capacity=51_200, expert_steps=25_600),
   total_steps=61_440,
 )
