@@ -6,6 +6,7 @@ an environment or an iteration takes beyond its parts is the rest.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import copy
 import dataclasses
 import functools
@@ -22,6 +23,7 @@ from apnpql_jax.cameras import make_cameras
 from apnpql_jax.config import EnvConfig
 from apnpql_jax.contact_report import SUBSTEPS
 from apnpql_jax.env import Env, EnvState
+from apnpql_jax.rollout import agent_policy
 from apnpql_jax.sim.mjx import MjxPhysics
 from apnpql_jax.sim.physics import Physics, PhysicsState
 from apnpql_jax.types import ARM_DOF, Array
@@ -57,33 +59,36 @@ def measure(
   """Times the parts of a period from the instant ``state``."""
   action, _ = random_policy(state, jax.random.key(0))
   velocity, close = action[:, :ARM_DOF], action[:, ARM_DOF]
-  programs = {"physics": (env.physics.step, (state.physics, velocity, close))}
+  moving = (state.physics, velocity, close)
+  work = physics_work(env.physics, state.physics)
+  found = {"physics": _timed(env.physics.step, moving, repeats, work)}
   if env.config.obs == "pixels":
     images = functools.partial(draw, env, env.config)
-    programs["rendering"] = (images, (state.physics,))
+    found["rendering"] = _timed(images, (state.physics,), repeats)
 
-  def act(params: Any, observation: Any, key: Array) -> Array:
-    return agent.act(params, observation, key, False)[0]
+  def act(params: Any, state: EnvState, key: Array) -> tuple[Array, Array]:
+    return agent_policy(agent, params, greedy=False)(state, key)
 
-  inputs = (params, state.timestep.observation, jax.random.key(0))
-  programs["networks"] = (act, inputs)
-  parts = {}
-  for name, (function, args) in programs.items():
-    if name == "physics":
-      work = physics_work(env.physics, state.physics)
-    else:
-      work = floor.count(function, *args)
-    run, _ = timing.compiled(jax.jit(function), *args)
-    times = timing.measure(functools.partial(run, *args), repeats=repeats)
-    parts[name] = Part(times.seconds, work.seconds())
-  return parts
+  looking = (params, state, jax.random.key(0))
+  return found | {"networks": _timed(act, looking, repeats)}
+
+
+def _timed(
+  function: Callable[..., Any],
+  args: tuple[Any, ...],
+  repeats: int,
+  work: floor.Work | None = None,
+) -> Part:
+  run, _ = timing.compiled(jax.jit(function), *args)
+  times = timing.measure(functools.partial(run, *args), repeats=repeats)
+  return Part(times.seconds, (work or floor.count(function, *args)).seconds())
 
 
 def shares(whole_s: float, parts: dict[str, float]) -> dict[str, float]:
   """Each part's share of the whole, and the rest's; parts may add up to more."""
   total = max(whole_s, sum(parts.values()))
   found = {name: seconds / total for name, seconds in parts.items()}
-  return found | {"rest": 1.0 - sum(found.values())}
+  return found | {"rest": max(0.0, 1.0 - sum(found.values()))}
 
 
 def physics_work(engine: Physics, state: PhysicsState) -> floor.Work:

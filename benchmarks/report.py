@@ -37,16 +37,18 @@ def main(argv: Sequence[str] | None = None) -> None:
   parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
   parser.add_argument("--measure", nargs="*", choices=SECTIONS, help="these, or all")
   args = parser.parse_args(argv)
+  failed = []
   if args.measure is not None:
-    measure(args.measure or list(SECTIONS))
+    failed = [name for name in args.measure or SECTIONS if not measure(name)]
   write()
+  if failed:
+    sys.exit(f"failed: {', '.join(failed)}")
 
 
-def measure(names: Sequence[str]) -> None:
-  """Runs one script after the other; each stores its report."""
-  for name in names:
-    script = tables.ROOT / "benchmarks" / f"{name}.py"
-    subprocess.run([sys.executable, str(script), "--store"], check=True)
+def measure(name: str) -> bool:
+  """Runs a script, which stores its report; whether it came to its end."""
+  script = tables.ROOT / "benchmarks" / f"{name}.py"
+  return not subprocess.run([sys.executable, str(script), "--store"]).returncode
 
 
 def write(results: Path = tables.RESULTS, docs: Path = tables.PERFORMANCE) -> None:

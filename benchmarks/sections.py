@@ -1,4 +1,4 @@
-"""The measured parts of docs/performance.md as text, made of the benchmarks' reports."""
+"""What docs/performance.md says of each benchmark, made of its report."""
 
 from __future__ import annotations
 
