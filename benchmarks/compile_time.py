@@ -13,7 +13,7 @@ can take less. ``--json`` prints one JSON object and nothing else.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 import itertools
 import os
 from pathlib import Path
@@ -40,7 +40,7 @@ PERIODS = 8
 PATIENCE_S = 1800.0
 
 
-def main(argv: Sequence[str] | None = None) -> None:
+def main() -> None:
   """Command line; see the module's docstring."""
   parser = timing.parser(__doc__, repeats=3)
   tasks = task_names()
@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> None:
   parser.add_argument(
     "--backends", nargs="+", choices=BACKENDS, default=settings.ENGINES
   )
-  args = timing.parse(parser, argv)
+  args = timing.parse(parser)
   if args.quick:
     args.tasks, args.backends, args.repeats = ["push_plate"], ["native"], 1
   timing.publish("compile_time", args, measure_all(args))

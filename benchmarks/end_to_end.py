@@ -11,7 +11,7 @@ same. ``--json`` prints one JSON object and nothing else.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 import dataclasses
 from typing import Any
 
@@ -33,13 +33,13 @@ from apnpql_jax.iteration import (
 )
 
 
-def main(argv: Sequence[str] | None = None) -> None:
+def main() -> None:
   """Command line; see the module's docstring."""
   parser = timing.parser(__doc__)
   settings.add_flags(parser)
   parser.add_argument("--rollout", type=int, help="periods; the preset's if left out")
   parser.add_argument("--updates", type=int, help="of an iteration; likewise")
-  args = timing.parse(parser, argv)
+  args = timing.parse(parser)
   timing.publish("end_to_end", args, measure_all(args))
 
 

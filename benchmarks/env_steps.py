@@ -10,7 +10,7 @@ preset. ``--json`` prints one JSON object and nothing else.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 import functools
 from typing import Any
 
@@ -27,11 +27,11 @@ from apnpql_jax.env import Env, EnvState, make_env
 from apnpql_jax.rollout import Policy, agent_policy, rollout
 
 
-def main(argv: Sequence[str] | None = None) -> None:
+def main() -> None:
   """Command line; see the module's docstring."""
   parser = timing.parser(__doc__)
   settings.add_flags(parser)
-  args = timing.parse(parser, argv)
+  args = timing.parse(parser)
   chosen = settings.chosen(args)
   results = (names | measure(config, args.repeats) for names, config in chosen)
   timing.publish("env_steps", args, results)

@@ -11,7 +11,7 @@ more of its contact pairs. Sizes for which the memory does not suffice are left 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 import dataclasses
 import functools
 import sys
@@ -56,7 +56,7 @@ Sizes = Iterator[tuple[str, int, Callable[..., Timed]]]
 """Series, size, and what times it, given ``repeats``."""
 
 
-def main(argv: Sequence[str] | None = None) -> None:
+def main() -> None:
   """Command line; see the module's docstring."""
   parser = timing.parser(__doc__, repeats=3)
   lists = functools.partial(parser.add_argument, nargs="+")
@@ -67,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> None:
   lists("--scales", type=float, default=[0.5, 1.0, 2.0, 4.0], help="of image sides")
   lists("--slots", type=int, default=[1280 * 4**n for n in range(5)], help="of replay")
   lists("--pairs", type=int, default=[4, 8, 16, 32, 53], help="that may touch")
-  args = timing.parse(parser, argv)
+  args = timing.parse(parser)
   if args.quick:
     args.backends, args.worlds, args.candidates = ["native"], [1, 2], [4]
     args.scales, args.slots, args.pairs = [1.0], [256], [4]

@@ -12,7 +12,7 @@ prints one JSON object and nothing else.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 import dataclasses
 import itertools
 import sys
@@ -37,13 +37,13 @@ sys.path.append(str(tables.ROOT / "tests"))
 from batches import random_batch  # noqa: E402  (the noise that the tests use)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
+def main() -> None:
   """Command line; see the module's docstring."""
   parser = timing.parser(__doc__)
   parser.add_argument("--preset", default="push_plate")
   parser.add_argument("--batch", type=int, nargs="+", default=[32, 64, 128])
   parser.add_argument("--candidates", type=int, nargs="+", default=[30, 120])
-  args = timing.parse(parser, argv)
+  args = timing.parse(parser)
   config = load_preset(args.preset).agent
   if args.quick:
     args.batch, args.candidates, config = [8], [8], tiny.CONFIG.agent

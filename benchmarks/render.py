@@ -11,7 +11,7 @@ installed. ``--json`` prints one JSON object and nothing else.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 import functools
 from typing import Any
 
@@ -33,9 +33,9 @@ RESOLUTIONS = {
 }
 
 
-def main(argv: Sequence[str] | None = None) -> None:
+def main() -> None:
   """Command line; see the module's docstring."""
-  args = timing.parse(_parser(), argv)
+  args = timing.parse(_parser())
   if args.quick:
     args.batch, args.resolutions = [1, 2], ["paper"]
   resolutions = {name: RESOLUTIONS[name] for name in args.resolutions}

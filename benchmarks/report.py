@@ -11,7 +11,7 @@ a pair of marks in the document. Those whose report is missing stay as they are.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 import json
 from pathlib import Path
 import subprocess
@@ -32,11 +32,11 @@ SECTIONS: dict[str, Callable[[sections.Report], str]] = {
 }
 
 
-def main(argv: Sequence[str] | None = None) -> None:
+def main() -> None:
   """Command line; see the module's docstring."""
   parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
   parser.add_argument("--measure", nargs="*", choices=SECTIONS, help="these, or all")
-  args = parser.parse_args(argv)
+  args = parser.parse_args()
   failed = []
   if args.measure is not None:
     failed = [name for name in args.measure or SECTIONS if not measure(name)]

@@ -123,11 +123,9 @@ def parser(doc: str | None, *, repeats: int = 5) -> argparse.ArgumentParser:
   return options
 
 
-def parse(
-  options: argparse.ArgumentParser, argv: Sequence[str] | None
-) -> argparse.Namespace:
+def parse(options: argparse.ArgumentParser) -> argparse.Namespace:
   """Reads the command line; to be quick is to repeat once only."""
-  args = options.parse_args(argv)
+  args = options.parse_args()
   args.repeats = 2 if args.quick else args.repeats
   return args
 
