@@ -199,8 +199,13 @@ def _replay(config: TrainConfig, count: int, *, repeats: int) -> Timed:
     ring, key = carry
     key, draw_key = jax.random.split(key)
     ring = replay.add(ring, chunk)
-    windows = {"n_step": config.agent.n_step, "gamma": config.agent.gamma}
-    batch = replay.sample(ring, draw_key, batch_size=BATCH, **windows)
+    batch = replay.sample(
+      ring,
+      draw_key,
+      batch_size=BATCH,
+      n_step=config.agent.n_step,
+      gamma=config.agent.gamma,
+    )
     return (ring, key), batch
 
   carry = (ring, jax.random.key(0))

@@ -102,6 +102,8 @@ def physics_work(engine: Physics, state: PhysicsState) -> floor.Work:
     if not contacts:
       model = copy.copy(scene.model)
       model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+      # Without a contact they are the same, but MJX has no elliptic cones then.
+      model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
       scene = dataclasses.replace(scene, model=model)
     world = jax.tree.map(lambda x: x[:1], state)
     step = MjxPhysics(scene, substeps=1).step

@@ -32,7 +32,8 @@ def chosen(args: argparse.Namespace) -> Iterator[tuple[dict[str, Any], TrainConf
   if args.quick:
     lists = (["push_plate"], ["native"], args.obs, [4])
   for values in itertools.product(*lists):
-    setting = dict(zip(("task", "backend", "obs", "worlds"), values, strict=True))
+    names = ("task", "backend", "obs", "worlds")
+    setting: dict[str, Any] = dict(zip(names, values, strict=True))
     base = tiny_pixels() if args.quick else load_preset(setting["task"])
     env = dataclasses.replace(base.env, **setting)
     yield setting, dataclasses.replace(base, env=env)
