@@ -55,15 +55,20 @@ def dicts(tree: Any) -> Iterator[dict[str, Any]]:
       yield from dicts(value)
 
 
+SLOW = pytest.mark.slow
+
+
 @pytest.mark.parametrize(
   ("script", "args"),
   [
     ("render", ["--alone"]),
-    ("learner", []),
-    ("env_steps", []),
-    ("end_to_end", []),
-    ("compile_time", []),
-    ("growth", []),
+    ("env_steps", ["--obs", "state"]),
+    ("growth", ["--axes", "candidates", "slots"]),
+    pytest.param("learner", [], marks=SLOW),
+    pytest.param("env_steps", [], marks=SLOW),
+    pytest.param("end_to_end", [], marks=SLOW),
+    pytest.param("compile_time", [], marks=SLOW),
+    pytest.param("growth", [], marks=SLOW),
   ],
 )
 def test_a_benchmark_reports_what_can_be(script, args):
@@ -154,11 +159,19 @@ def test_the_document_is_made_of_what_is_at_hand(tmp_path):
     }
     for size, seconds in ((1, 0.1), (4, 0.2), (16, 0.8))
   ]
-  for name, results in (("env_steps", [steps]), ("growth", points)):
-    (tmp_path / f"{name}.json").write_text(json.dumps(MACHINE | {"results": results}))
+  missing = {"resolution": "paper", "renderer": "pybullet_tiny", "missing": "no module"}
+  render = {"scene": "s", "resolutions": {"paper": {"global": (72, 96)}}}
+  reports = {
+    "render": render | {"results": [missing]},
+    "env_steps": {"results": [steps]},
+    "growth": {"results": points},
+  }
+  for name, fields in reports.items():
+    (tmp_path / f"{name}.json").write_text(json.dumps(MACHINE | fields))
   report.write(tmp_path, doc)
   text = doc.read_text()
-  assert text.count("as before") == len(report.SECTIONS) - 2
+  assert text.count("as before") == len(report.SECTIONS) - len(reports)
+  assert "| PyBullet, TinyRenderer | 1 | 72x96 | missing: no module |  |  |" in text
   assert "| t | mjx | pixels | 4 | 50 (40 to 60) | 1,000 | 5 % |" in text
   assert "| 60 % | 40 % |" in text
   assert "2 GFLOP/s and 1 GB/s" in text
