@@ -42,7 +42,7 @@ PATIENCE_S = 1800.0
 
 def main() -> None:
   """Command line; see the module's docstring."""
-  parser = timing.parser(__doc__, repeats=3)
+  parser = timing.parser(__doc__, repeats=2)
   tasks = task_names()
   parser.add_argument("--tasks", nargs="+", choices=tasks, default=tasks)
   parser.add_argument(
@@ -61,13 +61,13 @@ def measure_all(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     options = tiny.PRESET_ARGS if args.quick else short(task)
     command = ["train", task, *options, "--backend", backend]
     starts = [cold_and_warm(command) for _ in range(args.repeats)]
-    cold, warm = (timing.Times(wall, wall) for wall in zip(*starts, strict=True))
+    cold, warm = zip(*starts, strict=True)
     yield {
       "task": task,
       "backend": backend,
-      "cold": cold.spread(),
-      "warm": warm.spread(),
-      "imports": timing.Times(imports, imports).spread(),
+      "cold": timing.spread(cold),
+      "warm": timing.spread(warm),
+      "imports": timing.spread(imports),
     }
 
 

@@ -52,8 +52,8 @@ def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
   for name, policy in policies.items():
     times, compile_s = play(env, policy, params, state, length=length, repeats=repeats)
     times = times.per(length * worlds)
-    idle = {"env": ("networks",)}.get(name, ())
-    floor_s = sum(part.floor_s for key, part in found.items() if key not in idle)
+    idle = "networks" if name == "env" else None
+    floor_s = sum(part.floor_s for key, part in found.items() if key != idle)
     figures[name] = {
       **times.rate("step"),
       "compile_s": compile_s,

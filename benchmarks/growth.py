@@ -84,8 +84,8 @@ def measure_all(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
       except ConfigError as error:  # The memory does not suffice.
         print(f"{axis} {series} {size}: {error}", file=sys.stderr)
         continue
-      compared = floor.compare(floor_s, times.seconds)
-      yield {"axis": axis, "series": series, "size": size, **times.spread(), **compared}
+      figures = timing.spread(times.wall) | floor.compare(floor_s, times.seconds)
+      yield {"axis": axis, "series": series, "size": size, **figures}
 
 
 def worlds(config: TrainConfig, args: argparse.Namespace) -> Sizes:

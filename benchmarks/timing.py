@@ -43,14 +43,6 @@ class Times:
     """Those of one of the ``count`` things that a call does."""
     return Times([x / count for x in self.wall], [x / count for x in self.cpu])
 
-  def spread(self) -> dict[str, float]:
-    """Seconds for the report."""
-    return {
-      "seconds": self.seconds,
-      "seconds_low": min(self.wall),
-      "seconds_high": max(self.wall),
-    }
-
   def rate(self, name: str) -> dict[str, float]:
     """Things per second for the report; their CPU time tells whether the machine was
     at work on something else."""
@@ -60,6 +52,15 @@ class Times:
       f"{name}s_per_s_high": 1.0 / min(self.wall),
       f"cpu_us_per_{name}": 1e6 * statistics.median(self.cpu),
     }
+
+
+def spread(seconds: Sequence[float]) -> dict[str, float]:
+  """Seconds of all repeats for the report."""
+  return {
+    "seconds": statistics.median(seconds),
+    "seconds_low": min(seconds),
+    "seconds_high": max(seconds),
+  }
 
 
 class Carried:
@@ -124,7 +125,7 @@ def parser(doc: str | None, *, repeats: int = 5) -> argparse.ArgumentParser:
 
 
 def parse(options: argparse.ArgumentParser) -> argparse.Namespace:
-  """Reads the command line; to be quick is to repeat once only."""
+  """Reads the command line; whoever is quick repeats twice only."""
   args = options.parse_args()
   args.repeats = 2 if args.quick else args.repeats
   return args
