@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 import json
+import math
 from pathlib import Path
 import subprocess
 import sys
@@ -30,6 +31,9 @@ SECTIONS: dict[str, Callable[[sections.Report], str]] = {
   "compile_time": sections.compile_time,
   "growth": sections.growth,
 }
+
+COLUMNS = 3
+"""Of panels in a plot."""
 
 
 def main() -> None:
@@ -66,9 +70,12 @@ def plot_growth(report: sections.Report, out: Path) -> None:
   """Seconds by size, log-log, a panel for each axis; dashes grow in proportion, dots
   are the floor."""
   axes = sections.curves(report)
-  figure = Figure(figsize=(3.6 * len(axes), 3.4), layout="constrained")
-  panels = figure.subplots(1, len(axes), squeeze=False)
-  for panel, (axis, series) in zip(panels[0], axes.items(), strict=True):
+  rows = math.ceil(len(axes) / COLUMNS)
+  figure = Figure(figsize=(3.2 * COLUMNS, 2.8 * rows), layout="constrained")
+  panels = figure.subplots(rows, COLUMNS, squeeze=False)
+  for panel in panels.flat[len(axes) :]:
+    panel.set_visible(False)
+  for panel, (axis, series) in zip(panels.flat, axes.items(), strict=False):
     for name, points in series.items():
       sizes = [point["size"] for point in points]
       line = panel.loglog(sizes, [p["seconds"] for p in points], "o-", label=name)[0]
@@ -79,7 +86,8 @@ def plot_growth(report: sections.Report, out: Path) -> None:
       panel.loglog(sizes, floors, ":", color=line.get_color(), linewidth=0.8)
     panel.set_xlabel(sections.SIZES[axis])
     panel.legend()
-  panels[0][0].set_ylabel("s")
+  for panel in panels[:, 0]:
+    panel.set_ylabel("s")
   out.parent.mkdir(exist_ok=True)
   figure.savefig(out, dpi=120)
 
