@@ -1,11 +1,10 @@
 """The ray caster against MuJoCo's renderer on random states of every scene.
 
-  python benchmarks/fidelity.py
+  python benchmarks/fidelity.py --store
 
-Segmentation and depth of both cameras. Writes results/fidelity.json beside this file,
-the table in docs/performance.md, and the worst image of every scene to
-docs/images/fidelity.png: our image, our segmentation, MuJoCo's, and where they differ.
-Where MuJoCo cannot draw, its rays are the measure.
+Segmentation and depth of both cameras. ``--store`` keeps the JSON in results, and the
+worst image of every scene in docs/images/fidelity.png: our image, our segmentation,
+MuJoCo's, and where they differ. Where MuJoCo cannot draw, its rays are the measure.
 """
 
 from __future__ import annotations
@@ -33,6 +32,7 @@ SEEN = 20
 """Pixels from which a thing counts for the mean of the overlaps."""
 SCALE = 3
 """Enlargement of the images in the picture."""
+PICTURE = tables.ROOT / "docs" / "images" / "fidelity.png"
 
 
 def main() -> None:
@@ -40,6 +40,7 @@ def main() -> None:
   parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
   parser.add_argument("--states", type=int, default=32, help="of each scene")
   parser.add_argument("--json", action="store_true", help="print one JSON object")
+  parser.add_argument("--store", action="store_true", help="keep JSON and picture")
   args = parser.parse_args()
   oracle = render_oracles.available()[-1]
   rows, pictures = [], []
@@ -58,11 +59,9 @@ def main() -> None:
       if not args.json:
         print(rows[-1], flush=True)
   report = {"oracle": oracle, "states": args.states, **tables.machine(), "rows": rows}
-  tables.store("fidelity", report)
-  write(report)
-  out = tables.ROOT / "docs" / "images" / "fidelity.png"
-  out.parent.mkdir(exist_ok=True)
-  iio.imwrite(out, np.concatenate(pictures))
+  if args.store:
+    tables.store("fidelity", report)
+    iio.imwrite(PICTURE, np.concatenate(pictures))
   if args.json:
     print(json.dumps(report))
 
@@ -145,36 +144,6 @@ def picture(ours: Image, ids: np.ndarray, index: int) -> np.ndarray:
   views = (np.asarray(ours.rgb)[index], colors[seen], colors[ids[index]])
   row = np.concatenate([*views, np.repeat(wrong, 3, axis=-1)], axis=1)
   return row.repeat(SCALE, axis=0).repeat(SCALE, axis=1)
-
-
-def write(report: dict[str, Any]) -> None:
-  """The table in docs/performance.md."""
-  head = (
-    "scene",
-    "camera",
-    "pixels that agree",
-    "IoU, mean",
-    "IoU, least",
-    "depth error, median",
-    "99 %",
-  )
-  rows = [
-    (
-      row["scene"],
-      row["camera"],
-      f"{100 * row['agreeing']:.2f} %",
-      f"{row['iou_mean']:.3f}",
-      f"{row['iou_least']:.3f}",
-      f"{row['depth_median_um']:.1f} um",
-      f"{row['depth_p99_um']:.0f} um",
-    )
-    for row in report["rows"]
-  ]
-  against = {"rasteriser": "MuJoCo's rasteriser", "rays": "MuJoCo's rays"}
-  text = (
-    f"Against {against[report['oracle']]}, {report['states']} states of each scene."
-  )
-  tables.put("fidelity", f"{text}\n\n{tables.table(head, rows)}")
 
 
 if __name__ == "__main__":

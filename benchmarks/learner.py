@@ -1,130 +1,106 @@
 """Updates per second of the learner, by batch and candidates.
 
   python benchmarks/learner.py --quick
-  python benchmarks/learner.py --store    # keeps the table in docs/performance.md
+  python benchmarks/learner.py --store
 
 The agent is that of a preset, its transitions are noise. The features phi of a state
 are computed once and serve all candidate actions; "repeated" is the same learner that
-looks at the images again for each of them, which is what the paper saves. Compilation
-is timed apart; each figure is the median over repeats, with the lowest and the highest.
-``--json`` prints one JSON object and nothing else.
+looks at the images again for each of them, which is what the paper saves. ``--json``
+prints one JSON object and nothing else.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 import dataclasses
 import itertools
-import json
-import statistics
 import sys
-import time
 from typing import Any
 from unittest import mock
 
-import apnpql_jax  # noqa: F401  isort: skip  (before JAX: sets threads and cache)
+import timing  # isort: skip  (before JAX: sets threads and cache)
+import floor
 import jax
 import jax.numpy as jnp
 import tables
+import tiny
 
 from apnpql_jax.agents import learner
 from apnpql_jax.agents.learner import Agent, make_agent
 from apnpql_jax.agents.networks import Heads, Networks, Params, make_networks
 from apnpql_jax.config import AgentConfig
 from apnpql_jax.presets import load_preset
-from apnpql_jax.types import Array, Observation
+from apnpql_jax.types import Array, Observation, Transition
 
 sys.path.append(str(tables.ROOT / "tests"))
 from batches import random_batch  # noqa: E402  (the noise that the tests use)
 
-SECONDS = 2.0  # of work per repeat
-
 
 def main() -> None:
   """Command line; see the module's docstring."""
-  parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-  parser.add_argument("--json", action="store_true", help="print one JSON object")
-  parser.add_argument("--quick", action="store_true", help="few settings and repeats")
-  parser.add_argument("--store", action="store_true", help="keep JSON and table")
+  parser = timing.parser(__doc__)
   parser.add_argument("--preset", default="push_plate")
   parser.add_argument("--batch", type=int, nargs="+", default=[32, 64, 128])
   parser.add_argument("--candidates", type=int, nargs="+", default=[30, 120])
-  parser.add_argument("--repeats", type=int, default=5)
-  args = parser.parse_args()
-  if args.quick:
-    args.batch, args.candidates, args.repeats = [16], [8], 2
+  args = timing.parse(parser)
   config = load_preset(args.preset).agent
-  report = {
-    "benchmark": "learner",
-    "preset": args.preset,
-    **tables.machine(),
-    "repeats": args.repeats,
-    "results": [],
-  }
-  for result in measure_all(config, args):
-    report["results"].append(result)
-    if not args.json:
-      print(result, flush=True)
-  if args.json:
-    print(json.dumps(report))
-  if args.store:
-    tables.store("learner", report)
-    write(report)
+  if args.quick:
+    args.batch, args.candidates, config = [8], [8], tiny.CONFIG.agent
+  timing.publish("learner", args, measure_all(config, args), preset=args.preset)
 
 
-def measure_all(config: AgentConfig, args: argparse.Namespace) -> Iterator[dict]:
+def measure_all(
+  config: AgentConfig, args: argparse.Namespace
+) -> Iterator[dict[str, Any]]:
   """Figures of every setting, one after the other."""
   for batch, candidates in itertools.product(args.batch, args.candidates):
-    sized = dataclasses.replace(
-      config,
-      target_samples=candidates,
-      policy_samples=candidates,
-      # Epsilon must stay below the log of the candidates; it costs no time.
-      epsilon=min(config.epsilon, 1.0),
-    )
+    transitions = random_batch(0, batch, pixels=True)
     for phi, build in (("once", make_agent), ("repeated", forgetful_agent)):
-      figures = measure(build(sized), batch, args.repeats)
-      yield {"batch": batch, "candidates": candidates, "phi": phi, **figures}
+      agent = build(with_candidates(config, candidates))
+      times, compile_s, floor_s = measure(agent, transitions, args.repeats)
+      yield {
+        "batch": batch,
+        "candidates": candidates,
+        "phi": phi,
+        **times.rate("update"),
+        "compile_s": compile_s,
+        **floor.compare(floor_s, times.seconds),
+      }
 
 
-def measure(agent: Agent, batch: int, repeats: int) -> dict[str, Any]:
-  """Compiles and times updates in a scan, where training has them."""
-  transitions = random_batch(0, batch, pixels=True)
-  state = agent.init(jax.random.key(0), transitions.observation_tm1)
-
-  def updates(state, key, count: int):
-    def one(state, key):
-      state, metrics = agent.update(state, transitions, key)
-      return state, metrics["loss/q"]
-
-    return jax.lax.scan(one, state, jax.random.split(key, count))
-
-  began = time.perf_counter()
-  first = _compile(updates, state, 1)
-  compile_s = time.perf_counter() - began
-  seconds = min(_time(first, state) for _ in range(2))
-  count = max(1, round(SECONDS / seconds))
-  many = first if count == 1 else _compile(updates, state, count)
-  rates = [count / _time(many, state) for _ in range(repeats)]
-  return {
-    "updates_per_s": statistics.median(rates),
-    "updates_per_s_low": min(rates),
-    "updates_per_s_high": max(rates),
-    "compile_s": compile_s,
-  }
+def with_candidates(config: AgentConfig, count: int) -> AgentConfig:
+  """The same agent with another number of candidates."""
+  # Epsilon must stay below the log of the candidates; it costs no time.
+  epsilon = min(config.epsilon, 1.0)
+  return dataclasses.replace(
+    config, target_samples=count, policy_samples=count, epsilon=epsilon
+  )
 
 
-def _compile(updates: Callable, state: Any, count: int) -> Callable:
-  run = jax.jit(updates, static_argnums=2)
-  compiled = run.lower(state, jax.random.key(0), count).compile()
-  return lambda state: compiled(state, jax.random.key(0))
+def measure(
+  agent: Agent, transitions: Transition, repeats: int
+) -> tuple[timing.Times, float, float]:
+  """Times updates in a loop, where training has them.
 
+  Returns:
+    times of one update, seconds of compilation, the least seconds of an update.
+  """
+  key = jax.random.key(0)
+  state = jax.jit(agent.init)(key, transitions.observation_tm1)
 
-def _time(run: Callable, state: Any) -> float:
-  began = time.perf_counter()
-  jax.block_until_ready(run(state))
-  return time.perf_counter() - began
+  def updates(state: Any, count: Any) -> Any:
+    def one(index: Any, state: Any) -> Any:
+      return agent.update(state, transitions, jax.random.fold_in(key, index))[0]
+
+    return jax.lax.fori_loop(0, count, one, state)
+
+  run, compile_s = timing.compiled(jax.jit(updates), state, 1)
+  once = timing.measure(lambda: run(state, 1), repeats=1, seconds=0.0)
+  count = max(1, round(timing.SECONDS / once.seconds))
+  times = timing.measure(lambda: run(state, count), repeats=repeats, seconds=0.0)
+  work = floor.count(agent.update, state, transitions, key)
+  return times.per(count), compile_s, work.seconds()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,21 +142,6 @@ def forgetful_agent(config: AgentConfig) -> Agent:
 
   with mock.patch.object(learner, "make_networks", build):
     return make_agent(config)
-
-
-def write(report: dict[str, Any]) -> None:
-  """The table in docs/performance.md."""
-  rates: dict[tuple[int, int], dict[str, float]] = {}
-  for result in report["results"]:
-    setting = (result["batch"], result["candidates"])
-    rates.setdefault(setting, {})[result["phi"]] = result["updates_per_s"]
-  head = ("batch", "candidates", "phi once, updates/s", "repeated", "times faster")
-  rows = [
-    (*setting, rate["once"], rate["repeated"], rate["once"] / rate["repeated"])
-    for setting, rate in rates.items()
-  ]
-  note = f"{report['preset']}, {report['device']}, {report['cores']} cores."
-  tables.put("learner", f"{note}\n\n{tables.table(head, rows)}")
 
 
 if __name__ == "__main__":

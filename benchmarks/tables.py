@@ -38,9 +38,9 @@ def store(name: str, report: dict[str, Any]) -> None:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-  """A table in Markdown; numbers have three digits that count."""
+  """A table in Markdown; see ``number``."""
   lines = [head, ["---"] * len(head), *rows]
-  return "\n".join("| " + " | ".join(map(_cell, line)) + " |" for line in lines)
+  return "\n".join("| " + " | ".join(map(number, line)) + " |" for line in lines)
 
 
 def put(name: str, text: str, doc: Path = PERFORMANCE) -> None:
@@ -53,7 +53,8 @@ def put(name: str, text: str, doc: Path = PERFORMANCE) -> None:
   doc.write_text(f"{before}{begin}\n{text}\n{end}{after}")
 
 
-def _cell(value: Any) -> str:
+def number(value: Any) -> str:
+  """A cell; of a number three digits count."""
   if isinstance(value, float):
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
   return str(value)

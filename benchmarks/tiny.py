@@ -27,6 +27,8 @@ FAST_COMPILE = {
   "xla_backend_optimization_level": 0,
   "xla_llvm_disable_expensive_passes": True,
 }
+XLA_FLAGS = " ".join(f"--{name}={value}" for name, value in FAST_COMPILE.items())
+"""The same for the environment of a process."""
 
 CONFIG = TrainConfig(
   env=EnvConfig(worlds=4, bank_rows=256, obs="state", backend="native"),
@@ -51,7 +53,7 @@ CONFIG = TrainConfig(
 STEPS = CONFIG.env.worlds * CONFIG.rollout_length
 """Environment steps per iteration."""
 
-_PRESET_ARGS = (
+PRESET_ARGS = (  # The same on the command line, on top of push_plate's preset.
   "--env.worlds 4 --env.bank-rows 256 --obs state --backend native --agent.n-step 2 "
   "--agent.hidden 16 16 --agent.feature-dim 16 --agent.target-samples 4 "
   "--agent.policy-samples 4 --agent.m-step-delay 0 --replay.capacity 64 "
@@ -69,9 +71,8 @@ def start(
   if (run_dir / "config.json").exists():
     command += ["--resume", str(run_dir)]
   else:
-    command += ["push_plate", "--run", str(run_dir), *_PRESET_ARGS]
-  flags = " ".join(f"--{name}={value}" for name, value in FAST_COMPILE.items())
-  env = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": str(ROOT)}
+    command += ["push_plate", "--run", str(run_dir), *PRESET_ARGS]
+  env = os.environ | {"XLA_FLAGS": XLA_FLAGS, "PYTHONPATH": str(ROOT)}
   env |= {"JAX_LOG_COMPILES": "1"} if log_compiles else {}
   with said.open("ab") as file:
     return subprocess.Popen(

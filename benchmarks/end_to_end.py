@@ -1,0 +1,107 @@
+"""Training, steps and updates per second, and what an iteration consists of.
+
+  python benchmarks/end_to_end.py --quick
+  python benchmarks/end_to_end.py --store --backends native --tasks push_plate
+
+The iteration of `apnpql train` with the preset of each task: rollouts with the policy,
+then updates. Only the number of worlds differs; the replays are empty, which costs the
+same. ``--json`` prints one JSON object and nothing else.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+import dataclasses
+from typing import Any
+
+import timing  # isort: skip  (before JAX: sets threads and cache)
+import floor
+import jax
+import parts
+import settings
+
+from apnpql_jax.agents.learner import Agent, make_agent
+from apnpql_jax.config import TrainConfig
+from apnpql_jax.env import make_env
+from apnpql_jax.iteration import (
+  TrainState,
+  empty_expert,
+  initial_state,
+  make_iteration,
+  make_sample,
+)
+
+
+def main() -> None:
+  """Command line; see the module's docstring."""
+  parser = timing.parser(__doc__)
+  settings.add_flags(parser)
+  parser.add_argument("--rollout", type=int, help="periods; the preset's if left out")
+  parser.add_argument("--updates", type=int, help="of an iteration; likewise")
+  args = timing.parse(parser)
+  timing.publish("end_to_end", args, measure_all(args))
+
+
+def measure_all(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+  """Figures of every setting, one after the other."""
+  for names, config in settings.chosen(args):
+    config = dataclasses.replace(
+      config,
+      rollout_length=args.rollout or config.rollout_length,
+      updates_per_iteration=args.updates or config.updates_per_iteration,
+    )
+    yield names | measure(config, args.repeats)
+
+
+def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
+  """Figures of one setting."""
+  env, agent = make_env(config.env), make_agent(config.agent)
+  worlds, length = config.env.worlds, config.rollout_length
+  updates = config.updates_per_iteration
+  state = initial_state(config, env, agent, empty_expert)
+  run, compile_s = timing.compiled(make_iteration(config, env, agent), state)
+  iterations = timing.Carried(run, state)
+  times = timing.measure(iterations, repeats=repeats)
+  state = iterations.carry
+  found = parts.measure(env, agent, state.learner.params, state.env, repeats=repeats)
+  learning = learn(config, agent, state, repeats)
+  seconds = {name: length * part.seconds for name, part in found.items()}
+  floor_s = length * sum(part.floor_s for part in found.values())
+  return {
+    "rollout_length": length,
+    "updates_per_iteration": updates,
+    "batch": config.replay.batch_size,
+    **times.per(worlds * length).rate("step"),
+    **times.per(updates).rate("update"),
+    "compile_s": compile_s,
+    **floor.compare(floor_s + learning.floor_s, times.seconds),
+    "shares": parts.shares(times.seconds, seconds | {"learning": learning.seconds}),
+  }
+
+
+def learn(
+  config: TrainConfig, agent: Agent, state: TrainState, repeats: int
+) -> parts.Part:
+  """The updates of an iteration by themselves: batches are drawn and learnt from."""
+  sample = make_sample(config, agent)
+  key = jax.random.key(0)
+
+  def updates(learner: Any, ring: Any, expert: Any) -> tuple[Any, None]:
+    def one(learner: Any, key: Any) -> tuple[Any, None]:
+      return agent.update(learner, sample(ring, expert, key), key)[0], None
+
+    return jax.lax.scan(one, learner, jax.random.split(key, count))
+
+  count = config.updates_per_iteration
+  rings = (state.replay, state.expert_replay)
+  run, _ = timing.compiled(jax.jit(updates), state.learner, *rings)
+  carried = timing.Carried(lambda learner: run(learner, *rings), state.learner)
+  times = timing.measure(carried, repeats=repeats)
+  batch = jax.eval_shape(sample, *rings, key)
+  work = floor.count(agent.update, state.learner, batch, key).times(count)
+  return parts.Part(times.seconds, work.seconds())
+
+
+if __name__ == "__main__":
+  main()

@@ -1,0 +1,112 @@
+"""The least time that a computation can take on this machine.
+
+Operations and bytes are counted, and held against what a large matrix product and a
+large copy reach on the same machine: the larger of the two times is the floor. It is a
+floor of what the program is asked to do, not of the best program for the purpose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import functools
+import time
+from typing import Any, NamedTuple
+
+import jax
+from jax.extend import core
+import jax.numpy as jnp
+
+
+class Peak(NamedTuple):
+  """What the machine can do."""
+
+  flops_per_s: float  # f32 operations of a matrix product
+  bytes_per_s: float  # read and written by a copy
+
+
+class Work(NamedTuple):
+  """What a computation consists of."""
+
+  flops: float
+  bytes: float  # arguments and results, each once
+
+  def times(self, count: float) -> Work:
+    """The same, ``count`` times."""
+    return Work(count * self.flops, count * self.bytes)
+
+  def seconds(self) -> float:
+    """The least time it takes here."""
+    peak = machine_peak()
+    return max(self.flops / peak.flops_per_s, self.bytes / peak.bytes_per_s)
+
+
+def compare(floor_s: float, seconds: float) -> dict[str, float]:
+  """The floor for the report, and what share of the measured time it is."""
+  return {"floor_s": floor_s, "of_floor": floor_s / seconds}
+
+
+@functools.cache
+def machine_peak() -> Peak:
+  """Measured once per process; the fastest of some calls counts."""
+  size, length = (1024, 2**26) if jax.default_backend() == "cpu" else (8192, 2**30)
+  square = jnp.ones((size, size))
+  # As large as no cache is, and in place, for fresh memory would cost page faults.
+  copied = jnp.ones(length)
+  product = _fastest(jax.jit(lambda x: square @ x / size), jnp.copy(square))
+  copy = _fastest(jax.jit(lambda x: x + 1.0, donate_argnums=0), copied)
+  return Peak(2 * size**3 / product, 2 * nbytes(copied) / copy)
+
+
+def _fastest(step: Callable[[Any], Any], carry: Any, calls: int = 5) -> float:
+  carry = jax.block_until_ready(step(carry))
+  fastest = float("inf")
+  for _ in range(calls):
+    began = time.perf_counter()
+    carry = jax.block_until_ready(step(carry))
+    fastest = min(fastest, time.perf_counter() - began)
+  return fastest
+
+
+def count(function: Callable[..., Any], *args: Any) -> Work:
+  """Counts what ``function`` does with arguments of these shapes; nothing is run.
+
+  A loop counts as often as it turns, or once if that depends on the data. Of calls that
+  are not XLA's own, such as C MuJoCo or LAPACK, nothing is known.
+  """
+  closed, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
+  return Work(_flops(closed), nbytes(args) + nbytes(shapes))
+
+
+def nbytes(tree: Any) -> int:
+  """Bytes of arrays or of their shapes; random keys have none worth counting."""
+  leaves = jax.tree.leaves(tree)
+  return sum(x.size * getattr(x.dtype, "itemsize", 0) for x in leaves)
+
+
+def _flops(closed: core.ClosedJaxpr) -> float:
+  total = _flops_of_one_turn(closed)
+  for scan in _scans(closed.jaxpr):
+    body = scan.params["jaxpr"]
+    total += scan.params["length"] * _flops(body) - _flops_of_one_turn(body)
+  return total
+
+
+def _flops_of_one_turn(closed: core.ClosedJaxpr) -> float:
+  """JAX's own count, in which every loop turns once."""
+  shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in closed.in_avals]
+  lowered = jax.jit(core.jaxpr_as_fun(closed)).lower(*shapes)
+  cost = lowered.cost_analysis() or {}
+  return cost.get("flops", 0.0) + cost.get("transcendentals", 0.0)
+
+
+def _scans(jaxpr: core.Jaxpr) -> Iterator[core.JaxprEqn]:
+  """The outermost scans of a program."""
+  for equation in jaxpr.eqns:
+    if equation.primitive.name == "scan":
+      yield equation
+      continue
+    for value in jax.tree.leaves(
+      list(equation.params.values()), is_leaf=lambda x: hasattr(x, "eqns")
+    ):
+      if hasattr(value, "eqns"):
+        yield from _scans(getattr(value, "jaxpr", value))

@@ -1,0 +1,113 @@
+"""What a control period consists of, each part as a program that is timed alone.
+
+Physics, rendering and networks (the policy looks, draws candidates and picks one); what
+an environment or an iteration takes beyond its parts is the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import copy
+import dataclasses
+import functools
+from typing import Any, NamedTuple
+
+import floor
+import jax
+import jax.numpy as jnp
+import mujoco
+import timing
+
+from apnpql_jax.agents.learner import Agent
+from apnpql_jax.cameras import make_cameras
+from apnpql_jax.config import EnvConfig
+from apnpql_jax.contact_report import SUBSTEPS
+from apnpql_jax.env import Env, EnvState
+from apnpql_jax.rollout import agent_policy
+from apnpql_jax.sim.mjx import MjxPhysics
+from apnpql_jax.sim.physics import Physics, PhysicsState
+from apnpql_jax.types import ARM_DOF, Array
+
+_substep_flops: dict[tuple[str, bool], float] = {}
+"""Of one world; by fingerprint of the scene, and whether contacts count."""
+
+
+class Part(NamedTuple):
+  """A part of a control period of all worlds."""
+
+  seconds: float  # measured
+  floor_s: float  # the least possible
+
+
+def random_policy(state: EnvState, key: Array) -> tuple[Array, Array]:
+  """Actions uniform over the action box, as a ``rollout.Policy``."""
+  worlds = state.elapsed.shape[0]
+  arm_key, grip_key = jax.random.split(key)
+  velocity = jax.random.uniform(arm_key, (worlds, ARM_DOF), minval=-1.0, maxval=1.0)
+  close = jax.random.bernoulli(grip_key, shape=(worlds, 1)).astype(jnp.float32)
+  return jnp.concatenate([velocity, close], axis=-1), jnp.zeros(worlds)
+
+
+def draw(env: Env, config: EnvConfig, physics: PhysicsState) -> list[Array]:
+  """Both images of all worlds, in the sizes of ``config``."""
+  return [env.view(camera, physics) for camera in make_cameras(config, env.task.scene)]
+
+
+def measure(
+  env: Env, agent: Agent, params: Any, state: EnvState, *, repeats: int
+) -> dict[str, Part]:
+  """Times the parts of a period from the instant ``state``."""
+  action, _ = random_policy(state, jax.random.key(0))
+  velocity, close = action[:, :ARM_DOF], action[:, ARM_DOF]
+  moving = (state.physics, velocity, close)
+  work = physics_work(env.physics, state.physics)
+  found = {"physics": _timed(env.physics.step, moving, repeats, work)}
+  if env.config.obs == "pixels":
+    images = functools.partial(draw, env, env.config)
+    found["rendering"] = _timed(images, (state.physics,), repeats)
+
+  def act(params: Any, state: EnvState, key: Array) -> tuple[Array, Array]:
+    return agent_policy(agent, params, greedy=False)(state, key)
+
+  looking = (params, state, jax.random.key(0))
+  return found | {"networks": _timed(act, looking, repeats)}
+
+
+def _timed(
+  function: Callable[..., Any],
+  args: tuple[Any, ...],
+  repeats: int,
+  work: floor.Work | None = None,
+) -> Part:
+  run, _ = timing.compiled(jax.jit(function), *args)
+  times = timing.measure(functools.partial(run, *args), repeats=repeats)
+  return Part(times.seconds, (work or floor.count(function, *args)).seconds())
+
+
+def shares(whole_s: float, parts: dict[str, float]) -> dict[str, float]:
+  """Each part's share of the whole, and the rest's; parts may add up to more."""
+  total = max(whole_s, sum(parts.values()))
+  found = {name: seconds / total for name, seconds in parts.items()}
+  return found | {"rest": max(0.0, 1.0 - sum(found.values()))}
+
+
+def physics_work(engine: Physics, state: PhysicsState) -> floor.Work:
+  """One control period of all worlds.
+
+  Operations of C MuJoCo cannot be counted: those of MJX stand for them, without
+  contacts, of which C MuJoCo computes only the ones that are there.
+  """
+  scene, contacts = engine.scene, engine.name == "mjx"
+  if (known := (scene.fingerprint, contacts)) not in _substep_flops:
+    if not contacts:
+      model = copy.copy(scene.model)
+      model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+      # Without a contact they are the same, but MJX has no elliptic cones then.
+      model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+      scene = dataclasses.replace(scene, model=model)
+    world = jax.tree.map(lambda x: x[:1], state)
+    step = MjxPhysics(scene, substeps=1).step
+    one = floor.count(step, world, jnp.zeros((1, ARM_DOF)), jnp.zeros(1))
+    _substep_flops[known] = one.flops
+  flops = SUBSTEPS * len(state.time) * _substep_flops[known]
+  return floor.Work(flops, 2 * floor.nbytes(state))

@@ -1,0 +1,96 @@
+"""Makes the tables and plots of docs/performance.md.
+
+  python benchmarks/report.py                       # of what is in benchmarks/results
+  python benchmarks/report.py --measure             # after measuring it all, for hours
+  python benchmarks/report.py --measure render      # after measuring this anew
+
+A section is a report in benchmarks/results, the script of that name that stores it, and
+a pair of marks in the document. Those whose report is missing stay as they are.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+import json
+import math
+from pathlib import Path
+import subprocess
+import sys
+
+from matplotlib.figure import Figure
+import sections
+import tables
+
+SECTIONS: dict[str, Callable[[sections.Report], str]] = {
+  "fidelity": sections.fidelity,
+  "render": sections.render,
+  "learner": sections.learner,
+  "env_steps": sections.env_steps,
+  "end_to_end": sections.end_to_end,
+  "compile_time": sections.compile_time,
+  "growth": sections.growth,
+}
+
+COLUMNS = 3
+"""Of panels in a plot."""
+
+
+def main() -> None:
+  """Command line; see the module's docstring."""
+  parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+  parser.add_argument("--measure", nargs="*", choices=SECTIONS, help="these, or all")
+  args = parser.parse_args()
+  failed = []
+  if args.measure is not None:
+    failed = [name for name in args.measure or SECTIONS if not measure(name)]
+  write()
+  if failed:
+    sys.exit(f"failed: {', '.join(failed)}")
+
+
+def measure(name: str) -> bool:
+  """Runs a script, which stores its report; whether it came to its end."""
+  script = tables.ROOT / "benchmarks" / f"{name}.py"
+  return not subprocess.run([sys.executable, str(script), "--store"]).returncode
+
+
+def write(results: Path = tables.RESULTS, docs: Path = tables.PERFORMANCE) -> None:
+  """Puts every report at hand into the document, and draws the plots beside it."""
+  for name, section in SECTIONS.items():
+    path = results / f"{name}.json"
+    if path.exists():
+      report = json.loads(path.read_text())
+      tables.put(name, section(report), docs)
+      if name == "growth":
+        plot_growth(report, docs.parent / "images" / "growth.png")
+
+
+def plot_growth(report: sections.Report, out: Path) -> None:
+  """Seconds by size, log-log, a panel for each axis; dashes grow in proportion, dots
+  are the floor."""
+  axes = sections.curves(report)
+  rows = math.ceil(len(axes) / COLUMNS)
+  figure = Figure(figsize=(3.2 * COLUMNS, 2.8 * rows), layout="constrained")
+  panels = figure.subplots(rows, COLUMNS, squeeze=False)
+  for panel in panels.flat[len(axes) :]:
+    panel.set_visible(False)
+  for panel, (axis, series) in zip(panels.flat, axes.items(), strict=False):
+    for name, points in series.items():
+      sizes = [point["size"] for point in points]
+      line = panel.loglog(sizes, [p["seconds"] for p in points], "o-", label=name)[0]
+      last = points[-1]
+      in_proportion = [last["seconds"] * size / last["size"] for size in sizes]
+      panel.loglog(sizes, in_proportion, "--", color=line.get_color(), linewidth=0.8)
+      floors = [point["floor_s"] for point in points]
+      panel.loglog(sizes, floors, ":", color=line.get_color(), linewidth=0.8)
+    panel.set_xlabel(sections.SIZES[axis])
+    panel.legend()
+  for panel in panels[:, 0]:
+    panel.set_ylabel("s")
+  out.parent.mkdir(exist_ok=True)
+  figure.savefig(out, dpi=120)
+
+
+if __name__ == "__main__":
+  main()

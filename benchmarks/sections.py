@@ -1,0 +1,223 @@
+"""What docs/performance.md says of each benchmark, made of its report."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from tables import number, table
+
+Report = dict[str, Any]
+
+RENDERERS = {
+  "ray_caster": "ray caster",
+  "mujoco_egl": "MuJoCo, EGL",
+  "mujoco_osmesa": "MuJoCo, OSMesa",
+  "pybullet_tiny": "PyBullet, TinyRenderer",
+}
+SETTING = ("task", "backend", "obs", "worlds")
+SIZES = {
+  "worlds": "worlds",
+  "candidates": "candidates",
+  "pixels": "pixels of a pair of images",
+  "slots": "slots of the replay",
+  "contacts": "contact slots",
+}
+"""Axis of growth -> what its sizes count."""
+
+
+def fidelity(report: Report) -> str:
+  """How the ray caster's images compare with MuJoCo's."""
+  head = (
+    "scene",
+    "camera",
+    "pixels that agree",
+    "IoU, mean",
+    "IoU, least",
+    "depth error, median",
+    "99 %",
+  )
+  rows = [
+    (
+      row["scene"],
+      row["camera"],
+      f"{100 * row['agreeing']:.2f} %",
+      f"{row['iou_mean']:.3f}",
+      f"{row['iou_least']:.3f}",
+      f"{row['depth_median_um']:.1f} um",
+      f"{row['depth_p99_um']:.0f} um",
+    )
+    for row in report["rows"]
+  ]
+  against = {"rasteriser": "MuJoCo's rasteriser", "rays": "MuJoCo's rays"}
+  text = (
+    f"Against {against[report['oracle']]}, {report['states']} states of each scene."
+  )
+  return f"{text}\n\n{table(head, rows)}"
+
+
+def render(report: Report) -> str:
+  """Pairs of images per second."""
+  head = ("renderer", "batch", "images", "pairs/s", "limit", "reached")
+  rows = []
+  for result in report["results"]:
+    sizes = report["resolutions"][result["resolution"]].values()
+    images = " + ".join(f"{height}x{width}" for height, width in sizes)
+    label = (RENDERERS[result["renderer"]], result.get("batch", 1), images)
+    rows.append((*label, *rate(result, "pairs")))
+  return f"{report['scene']}. {note(report)}\n\n{table(head, rows)}"
+
+
+def learner(report: Report) -> str:
+  """Updates per second, with and without the features being shared."""
+  found: dict[tuple[int, int], dict[str, Any]] = {}
+  for result in report["results"]:
+    setting = (result["batch"], result["candidates"])
+    found.setdefault(setting, {})[result["phi"]] = result
+  head = (
+    "batch",
+    "candidates",
+    "phi once, updates/s",
+    "limit",
+    "reached",
+    "repeated, updates/s",
+    "times faster",
+  )
+  rows = []
+  for setting, kinds in found.items():
+    once, again = kinds["once"], kinds["repeated"]
+    gain = once["updates_per_s"] / again["updates_per_s"]
+    rows.append((*setting, *rate(once, "updates"), rate(again, "updates")[0], gain))
+  return f"{report['preset']}. {note(report)}\n\n{table(head, rows)}"
+
+
+def env_steps(report: Report) -> str:
+  """Steps per second without and with the policy."""
+  parts = _parts(report)
+  head = (
+    *SETTING,
+    "env, steps/s",
+    "limit",
+    "reached",
+    "env + policy, steps/s",
+    "limit",
+    "reached",
+    *parts,
+  )
+  rows = [
+    (
+      *(result[name] for name in SETTING),
+      *rate(result["env"], "steps"),
+      *rate(result["env_policy"], "steps"),
+      *(percent(result["shares"].get(part, 0.0)) for part in parts),
+    )
+    for result in report["results"]
+  ]
+  return f"{note(report)}\n\n{table(head, rows)}"
+
+
+def end_to_end(report: Report) -> str:
+  """Steps and updates per second of training."""
+  parts = _parts(report)
+  head = (*SETTING, "steps/s", "limit", "reached", "updates/s", *parts)
+  rows = [
+    (
+      *(result[name] for name in SETTING),
+      *rate(result, "steps"),
+      spread(result, "updates_per_s"),
+      *(percent(result["shares"].get(part, 0.0)) for part in parts),
+    )
+    for result in report["results"]
+  ]
+  return f"{note(report)}\n\n{table(head, rows)}"
+
+
+def compile_time(report: Report) -> str:
+  """Seconds until the first iteration is done."""
+  head = ("task", "backend", "cold, s", "warm, s", "imports alone, s")
+  rows = [
+    (
+      result["task"],
+      result["backend"],
+      *(spread(result[kind], "seconds") for kind in ("cold", "warm", "imports")),
+    )
+    for result in report["results"]
+  ]
+  return f"{note(report)}\n\n{table(head, rows)}"
+
+
+def growth(report: Report) -> str:
+  """A table for each axis; the exponent since the last size is one where time grows in
+  proportion."""
+  tables = []
+  for axis, series in curves(report).items():
+    head, rows = [SIZES[axis]], {}
+    for name, points in series.items():
+      head += [f"{name}, ms", "exponent", "reached"]
+      for last, point in zip([None, *points], points, strict=False):
+        rows.setdefault(point["size"], [point["size"]]).extend(_point(last, point))
+    tables.append(table(head, rows.values()))
+  return "\n\n".join([note(report), "![growth](images/growth.png)", *tables])
+
+
+def curves(report: Report) -> dict[str, dict[str, list[dict[str, Any]]]]:
+  """The points of growth by axis and series."""
+  found: dict[str, dict[str, list[dict[str, Any]]]] = {}
+  for point in report["results"]:
+    series = found.setdefault(point["axis"], {})
+    series.setdefault(point["series"], []).append(point)
+  return found
+
+
+def _point(last: dict[str, Any] | None, point: dict[str, Any]) -> list[Any]:
+  exponent: Any = ""
+  if last is not None:
+    slower = math.log(point["seconds"] / last["seconds"])
+    exponent = f"{slower / math.log(point['size'] / last['size']):.2f}"
+  names = ("seconds", "seconds_low", "seconds_high")
+  in_ms = {name: 1e3 * point[name] for name in names}
+  return [spread(in_ms, "seconds"), exponent, percent(point["of_floor"])]
+
+
+def rate(result: dict[str, Any], name: str) -> tuple[Any, Any, Any]:
+  """Cells: so many per second, the limit of this machine, and what share is reached."""
+  if "missing" in result:
+    return f"missing: {result['missing']}", "", ""
+  median = spread(result, f"{name}_per_s")
+  if "of_floor" not in result:
+    return median, "", ""
+  limit = result[f"{name}_per_s"] / result["of_floor"]
+  return median, limit, percent(result["of_floor"])
+
+
+def spread(result: dict[str, Any], name: str) -> str:
+  """The median with the lowest and the highest of the repeats, where there are some."""
+  median = number(result[name])
+  if f"{name}_low" not in result:
+    return median
+  return (
+    f"{median} ({number(result[f'{name}_low'])} to {number(result[f'{name}_high'])})"
+  )
+
+
+def percent(share: float) -> str:
+  """A share, with two digits that count where it is small."""
+  return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"
+
+
+def note(report: Report) -> str:
+  """The machine and what it can do."""
+  versions = ", ".join(f"{name} {x}" for name, x in report["versions"].items())
+  peak = report["peak"]
+  return (
+    f"{report['device']}, {report['cores']} cores, {versions}, commit "
+    f"{report['commit'] or 'unknown'}; {number(peak['flops_per_s'] / 1e9)} GFLOP/s and "
+    f"{number(peak['bytes_per_s'] / 1e9)} GB/s; medians of {report['repeats']} (lowest "
+    "to highest)."
+  )
+
+
+def _parts(report: Report) -> list[str]:
+  """Names of all parts that some result has, the rest last."""
+  names = {name: None for result in report["results"] for name in result["shares"]}
+  return [*(name for name in names if name != "rest"), "rest"]

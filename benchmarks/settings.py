@@ -1,0 +1,46 @@
+"""The settings that environment and training are timed in: flags, and presets."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+import dataclasses
+import itertools
+from typing import Any
+
+import tiny
+
+from apnpql_jax.config import BACKENDS, OBSERVATIONS, TrainConfig
+from apnpql_jax.presets import load_preset
+from apnpql_jax.tasks import task_names
+
+ENGINES = ("native", "mjx")
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+  """Flags of which every combination is timed."""
+  tasks = task_names()
+  parser.add_argument("--tasks", nargs="+", choices=tasks, default=tasks)
+  parser.add_argument("--backends", nargs="+", choices=BACKENDS, default=ENGINES)
+  parser.add_argument("--obs", nargs="+", choices=OBSERVATIONS, default=["pixels"])
+  parser.add_argument("--worlds", type=int, nargs="+", default=[32, 128])
+
+
+def chosen(args: argparse.Namespace) -> Iterator[tuple[dict[str, Any], TrainConfig]]:
+  """Every combination of the flags: what it is called, and its preset."""
+  lists = (args.tasks, args.backends, args.obs, args.worlds)
+  if args.quick:
+    lists = (["push_plate"], ["native"], args.obs, [4])
+  for values in itertools.product(*lists):
+    names = ("task", "backend", "obs", "worlds")
+    setting: dict[str, Any] = dict(zip(names, values, strict=True))
+    base = tiny_pixels() if args.quick else load_preset(setting["task"])
+    env = dataclasses.replace(base.env, **setting)
+    yield setting, dataclasses.replace(base, env=env)
+
+
+def tiny_pixels() -> TrainConfig:
+  """A run so small that its figures mean nothing, with images."""
+  sizes = {"global_size": (12, 16), "wrist_size": (8, 12)}
+  env = dataclasses.replace(tiny.CONFIG.env, obs="pixels", **sizes)
+  return dataclasses.replace(tiny.CONFIG, env=env)

@@ -1,0 +1,181 @@
+"""The benchmarks: each runs and reports what can be, and the document is made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import json
+import os
+import subprocess
+import sys
+import time
+from typing import Any
+
+import floor
+import jax
+import jax.numpy as jnp
+import parts
+import pytest
+import report
+import tables
+import timing
+import tiny
+
+PEAK = {"flops_per_s": 2e9, "bytes_per_s": 1e9}
+MACHINE = {
+  "device": "a machine",
+  "cores": 2,
+  "versions": {"jax": "1.2"},
+  "commit": "abc",
+  "peak": PEAK,
+  "repeats": 3,
+}
+
+
+def run(script: str, *args: str) -> dict[str, Any]:
+  """The report of a benchmark in a process of its own; it prints nothing else."""
+  done = subprocess.run(
+    [sys.executable, f"benchmarks/{script}.py", "--quick", "--json", *args],
+    cwd=tables.ROOT,
+    env=os.environ | {"XLA_FLAGS": tiny.XLA_FLAGS, "PYTHONPATH": str(tables.ROOT)},
+    capture_output=True,
+    text=True,
+    check=False,
+  )
+  assert done.returncode == 0, done.stderr
+  return json.loads(done.stdout)
+
+
+def dicts(tree: Any) -> Iterator[dict[str, Any]]:
+  """All dictionaries in a report."""
+  if isinstance(tree, dict):
+    yield tree
+    tree = list(tree.values())
+  if isinstance(tree, list):
+    for value in tree:
+      yield from dicts(value)
+
+
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+  ("script", "args"),
+  [
+    ("render", ["--alone"]),
+    ("env_steps", ["--obs", "state"]),
+    ("growth", ["--axes", "candidates", "slots"]),
+    pytest.param("learner", [], marks=SLOW),
+    pytest.param("env_steps", [], marks=SLOW),
+    pytest.param("end_to_end", [], marks=SLOW),
+    pytest.param("compile_time", [], marks=SLOW),
+    pytest.param("growth", [], marks=SLOW),
+  ],
+)
+def test_a_benchmark_reports_what_can_be(script, args):
+  found = run(script, *args)
+  assert found["benchmark"] == script and found["results"]
+  assert found["cores"] >= 1 and found["versions"]["jax"] == jax.__version__
+  assert min(found["peak"].values()) > 0
+  spreads = 0
+  for entry in dicts(found["results"]):
+    for name in [key[:-4] for key in entry if key.endswith("_low")]:
+      assert 0 < entry[f"{name}_low"] <= entry[name] <= entry[f"{name}_high"]
+      spreads += 1
+    if "shares" in entry:
+      assert all(0 <= share <= 1 for share in entry["shares"].values())
+      assert sum(entry["shares"].values()) == pytest.approx(1.0)
+    if "floor_s" in entry:
+      assert entry["floor_s"] > 0 and entry["of_floor"] > 0
+  assert spreads
+  # What a script reports, the document can be made of.
+  assert "| --- |" in report.SECTIONS[script](found)
+
+
+def test_operations_are_counted_as_often_as_loops_turn():
+  x = jnp.ones((8, 8))
+
+  def inner(x, _):
+    return x @ x, None
+
+  def outer(x, _):
+    return jax.lax.scan(inner, x @ x, length=3)[0], None
+
+  def program(x):
+    return jax.lax.scan(outer, x, length=5)[0]
+
+  product = 2 * 8**3
+  work = floor.count(jax.jit(program), x)
+  assert work.flops == pytest.approx(5 * 4 * product, rel=0.01)
+  assert work.bytes == 2 * x.nbytes
+  assert work.times(2.0) == (2 * work.flops, 2 * work.bytes)
+
+
+def test_the_floor_is_the_slower_of_computing_and_moving(monkeypatch):
+  monkeypatch.setattr(floor, "machine_peak", lambda: floor.Peak(10.0, 100.0))
+  assert floor.Work(20.0, 100.0).seconds() == 2.0
+  assert floor.Work(20.0, 500.0).seconds() == 5.0
+
+
+def test_times_are_of_one_call():
+  calls = []
+
+  def nap() -> jax.Array:
+    calls.append(time.sleep(0.01))
+    return jnp.zeros(())
+
+  times = timing.measure(nap, repeats=3, seconds=0.03)
+  assert len(times.wall) == 3 and len(calls) >= 8
+  assert 0.01 <= times.seconds < 0.03
+  assert times.per(10).seconds == pytest.approx(times.seconds / 10)
+
+
+def test_shares_add_up_even_if_parts_are_slower_alone():
+  assert parts.shares(4.0, {"a": 1.0, "b": 2.0}) == {"a": 0.25, "b": 0.5, "rest": 0.25}
+  shares = parts.shares(2.0, {"a": 1.0, "b": 3.0})
+  assert shares == {"a": 0.25, "b": 0.75, "rest": 0.0}
+
+
+def test_the_document_is_made_of_what_is_at_hand(tmp_path):
+  doc = tmp_path / "performance.md"
+  marks = [
+    f"<!-- {name} -->\nas before\n<!-- end {name} -->" for name in report.SECTIONS
+  ]
+  doc.write_text("\n".join(marks))
+  speed = {"steps_per_s": 50.0, "steps_per_s_low": 40.0, "steps_per_s_high": 60.0}
+  speed |= {"floor_s": 0.001, "of_floor": 0.05}
+  setting = {"task": "t", "backend": "mjx", "obs": "pixels", "worlds": 4}
+  shares = {"physics": 0.6, "rest": 0.4}
+  steps = {**setting, "env": speed, "env_policy": speed, "shares": shares}
+  points = [
+    {
+      "axis": "worlds",
+      "series": "mjx",
+      "size": size,
+      "seconds": seconds,
+      "seconds_low": seconds,
+      "seconds_high": seconds,
+      "floor_s": 1e-6,
+      "of_floor": 0.5,
+    }
+    for size, seconds in ((1, 0.1), (4, 0.2), (16, 0.8))
+  ]
+  missing = {"resolution": "paper", "renderer": "pybullet_tiny", "missing": "no module"}
+  render = {"scene": "s", "resolutions": {"paper": {"global": (72, 96)}}}
+  reports = {
+    "render": render | {"results": [missing]},
+    "env_steps": {"results": [steps]},
+    "growth": {"results": points},
+  }
+  for name, fields in reports.items():
+    (tmp_path / f"{name}.json").write_text(json.dumps(MACHINE | fields))
+  report.write(tmp_path, doc)
+  text = doc.read_text()
+  assert text.count("as before") == len(report.SECTIONS) - len(reports)
+  assert "| PyBullet, TinyRenderer | 1 | 72x96 | missing: no module |  |  |" in text
+  assert "| t | mjx | pixels | 4 | 50 (40 to 60) | 1,000 | 5 % |" in text
+  assert "| 60 % | 40 % |" in text
+  assert "2 GFLOP/s and 1 GB/s" in text
+  # Half of proportional from 1 to 4, proportional from there on.
+  assert "| 4 | 200 (200 to 200) | 0.50 | 50 % |" in text
+  assert "| 16 | 800 (800 to 800) | 1.00 | 50 % |" in text
+  assert (tmp_path / "images" / "growth.png").stat().st_size > 1000
