@@ -1,0 +1,44 @@
+"""The GPU suite in small, on a CPU: its report, its budget, what fails in it."""
+
+from __future__ import annotations
+
+import json
+
+import gpu_suite
+
+
+def run(tmp_path, *args: str) -> dict:
+  """The report of a quick run."""
+  out = tmp_path / "report.json"
+  gpu_suite.main(["--quick", "--jobs", "1", "--out", str(out), *args])
+  return json.loads(out.read_text())["sections"]
+
+
+def test_figures_are_in_the_report(tmp_path):
+  section = run(tmp_path, "--sections", "device", "--budget", "300")["device"]
+  assert section["status"] == "done" and not section["missing"]
+  found = {result["what"]: result for result in section["results"]}
+  assert set(section["plan"]) < set(found)
+  assert found["copy"]["gib_per_s"] > 0 and found["copy"]["quiet"]
+  assert found["product float32"]["compile_s"] > 0
+
+
+def test_what_does_not_fit_into_the_budget_is_named(tmp_path):
+  sections = run(tmp_path, "--sections", "device", "engines", "--budget", "0")
+  assert sections["device"]["status"] == "skipped: no time was left"
+  assert sections["engines"]["status"] == "skipped: no time was left"
+
+
+def test_a_section_that_fails_or_is_late_keeps_its_place(tmp_path):
+  report = gpu_suite.Report(tmp_path / "report.json")
+  env = gpu_suite._environment(gpu_suite._arguments(["--quick"]), tmp_path)
+  settings = gpu_suite.QUICK | {"folder": str(tmp_path), "threads": 1}
+  running = [
+    gpu_suite.Running(name, settings, env, report)
+    for name in ("worlds/nothing", "device")
+  ]
+  running[1].finish(deadline=0.0)
+  running[0].finish(deadline=float("inf"))
+  assert report["device"]["status"] == "stopped: its time was over"
+  assert report["worlds/nothing"]["status"].startswith("failed: ")
+  assert "nothing" in report["worlds/nothing"]["status"]
