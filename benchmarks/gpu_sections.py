@@ -83,33 +83,33 @@ def measure_all(items: Iterable[Item], settings: Settings) -> None:
   emit(plan=[item.what for item in items])
   tracing = threading.Lock()
 
-  def build(item: Item) -> tuple[Any, float, float]:
+  def build(item: Item) -> tuple[Any, Any, dict[str, float]]:
     with _lock(settings, "compile", shared=True):
       with tracing:
         began = time.perf_counter()
         lowered = item.lower()
-        trace_s = time.perf_counter() - began
-      began = time.perf_counter()
-      return lowered.compile(), trace_s, time.perf_counter() - began
+        traced = time.perf_counter()
+      program = lowered.compile()
+      seconds = {"trace_s": traced - began, "compile_s": time.perf_counter() - traced}
+      return program, item.args(), seconds
 
   with concurrent.futures.ThreadPoolExecutor(settings["threads"]) as pool:
     futures = {pool.submit(build, item): item for item in items}
     for future in concurrent.futures.as_completed(futures):
       item = futures[future]
       try:
-        program, trace_s, compile_s = future.result()
+        program, args, seconds = future.result()
         with measuring(settings) as quiet:
-          figures = _measure(item, program, settings)
-        emit(
-          what=item.what, trace_s=trace_s, compile_s=compile_s, quiet=quiet, **figures
-        )
+          figures = _measure(item, program, list(args), settings)
+        emit(what=item.what, quiet=quiet, **seconds, **figures)
       except Exception as error:  # One figure must not cost the others.
         reason = (str(error).splitlines() or [""])[0][:300]
         emit(what=item.what, error=f"{type(error).__name__}: {reason}")
 
 
-def _measure(item: Item, program: Any, settings: Settings) -> dict[str, Any]:
-  args = list(item.args())
+def _measure(
+  item: Item, program: Any, args: list[Any], settings: Settings
+) -> dict[str, Any]:
   rates = []
   for repeat in range(1 + settings["repeats"]):
     calls, began = 0, time.perf_counter()
@@ -208,12 +208,15 @@ def device(settings: Settings) -> None:
 
 
 def engines(settings: Settings) -> None:
-  """A control period of plain ``mjx.step`` on push_plate: cures, precision, Warp."""
+  """A control period of plain ``mjx.step`` on push_plate: cures, precision, Warp.
+
+  Each final state is compared with that of the variant that was measured first.
+  """
   count, reference = settings["engine_worlds"], {}
-  scene = make_task("push_plate").scene
-  model = scene.model
-  substeps = settings["substeps"]
-  qpos = jnp.tile(jnp.asarray(scene.keyframe("neutral"), jnp.float32), (count, 1))
+  task, substeps = make_task("push_plate"), settings["substeps"]
+  model = task.scene.model
+  draw = task.sample_resets(np.random.default_rng(0), count)
+  qpos = jnp.asarray(draw.qpos, jnp.float32)
 
   def lower(impl: str, barrier: bool, cones: bool, precision: str) -> Any:
     kept = mjx.make_data(model, impl="jax")._impl
@@ -247,9 +250,13 @@ def engines(settings: Settings) -> None:
   measure_all(
     (
       Item(
-        name, functools.partial(lower, *variant), lambda: (qpos,), count, look=differs
+        name,
+        functools.partial(lower, *variants[name]),
+        lambda: (qpos,),
+        count,
+        look=differs,
       )
-      for name, variant in variants.items()
+      for name in settings["engines"]
     ),
     settings,
   )
@@ -312,7 +319,7 @@ def learner(settings: Settings) -> None:
     # A function of its own, for what has been traced once is not traced again.
     run = functools.partial(many)
     with jax.default_matmul_precision(precision):
-      return jax.jit(run).lower(*jax.eval_shape(args, size))
+      return jax.jit(run).lower(*jax.eval_shape(functools.partial(args, size)))
 
   measure_all(
     (
@@ -376,7 +383,7 @@ def random_action(key: Array, count: int) -> Array:
 def worlds(settings: Settings) -> None:
   """Environment steps with both cameras of one task, by the number of worlds."""
   config = EnvConfig(
-    task=settings["task"], backend="mjx", bank_rows=settings["bank_rows"]
+    task=settings["task"], backend=settings["backend"], bank_rows=settings["bank_rows"]
   )
   env = make_env(config)
 
@@ -423,7 +430,10 @@ def gpu_config(settings: Settings, worlds: int) -> TrainConfig:
   return dataclasses.replace(
     base,
     env=dataclasses.replace(
-      base.env, backend="mjx", worlds=worlds, bank_rows=settings["bank_rows"]
+      base.env,
+      backend=settings["backend"],
+      worlds=worlds,
+      bank_rows=settings["bank_rows"],
     ),
     agent=agent_config(settings),
     replay=dataclasses.replace(

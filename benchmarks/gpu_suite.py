@@ -35,7 +35,16 @@ AFTER_TRAINING_S = 30.0
 FULL: dict[str, Any] = {
   "seconds": 0.5,
   "repeats": 3,
+  "backend": "mjx",
   "matrix": 8192,
+  "engines": [
+    "jax, cones",
+    "jax, barrier and cones",
+    "jax, barrier",
+    "jax, stock",
+    "jax, cones, TF32",
+    "warp",
+  ],
   "engine_worlds": 1024,
   "substeps": 30,
   "render_worlds": 1024,
@@ -55,7 +64,10 @@ FULL: dict[str, Any] = {
 QUICK: dict[str, Any] = FULL | {
   "seconds": 0.01,
   "repeats": 1,
+  "backend": "auto",
   "matrix": 64,
+  # The others take minutes to compile on a CPU.
+  "engines": ["jax, barrier and cones", "warp"],
   "engine_worlds": 2,
   "substeps": 1,
   "render_worlds": 2,

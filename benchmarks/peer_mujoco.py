@@ -39,12 +39,8 @@ class MujocoEnv:
     self._limit = model.actuator_ctrlrange[:, 1]
     self._wanted, self._force = np.zeros(model.nv), np.zeros(model.nv)
     self._substeps = round(CONTROL_PERIOD_S / model.opt.timestep)
+    self._renderers: dict[str, mujoco.Renderer] = {}
     model.vis.quality.offsamples = model.vis.quality.shadowsize = 0
-
-  @functools.cached_property
-  def _renderers(self) -> dict[str, mujoco.Renderer]:
-    sizes = self.world.cameras.items()
-    return {name: mujoco.Renderer(self.world.model, *size) for name, size in sizes}
 
   def reset(self, row: int) -> None:
     """See ``peer_worlds.Env``."""
@@ -64,10 +60,16 @@ class MujocoEnv:
     if images:
       mujoco.mj_kinematics(model, data)
       mujoco.mj_camlight(model, data)
-      for name, renderer in self._renderers.items():
-        renderer.update_scene(data, name)
-        seen[name] = renderer.render()
+      seen |= {name: self.image(name) for name in self.world.cameras}
     return seen
+
+  def image(self, name: str) -> np.ndarray:
+    """u8[H, W, 3]."""
+    if name not in self._renderers:
+      size = self.world.cameras[name]
+      self._renderers[name] = mujoco.Renderer(self.world.model, *size)
+    self._renderers[name].update_scene(self.data, name)
+    return self._renderers[name].render()
 
   def _control(self, action: np.ndarray) -> np.ndarray:
     """f64[7]: inverse dynamics of the arm, a bounded servo of the gripper."""
