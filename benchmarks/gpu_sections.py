@@ -24,10 +24,10 @@ from typing import Any
 from unittest import mock
 
 import apnpql_jax  # isort: skip  (before JAX: sets threads and cache)
+from cures import cures
 import jax
 import jax.numpy as jnp
 from mujoco import mjx
-from mujoco.mjx._src import scan as mjx_scan, solver as mjx_solver
 import numpy as np
 
 from apnpql_jax.agents.learner import make_agent
@@ -39,7 +39,7 @@ from apnpql_jax.iteration import collect_expert, initial_state, make_iteration
 from apnpql_jax.presets import load_preset
 from apnpql_jax.render import raycast
 from apnpql_jax.rollout import agent_policy, rollout
-from apnpql_jax.sim import mjx_patches, physics
+from apnpql_jax.sim import physics
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.tasks import make_task
 from apnpql_jax.types import Array, Observation, Transition
@@ -231,7 +231,8 @@ def engines(settings: Settings) -> None:
       start = data.replace(qpos=qpos)
       return jax.lax.scan(step, start, None, length=substeps)[0].qpos
 
-    with _patches(barrier, cones), jax.default_matmul_precision(precision):
+    chosen = cures(barrier=barrier, cones=cones)
+    with chosen, jax.default_matmul_precision(precision):
       return jax.jit(jax.vmap(world)).lower(qpos)
 
   def differs(qpos: Array) -> dict[str, Any]:
@@ -260,19 +261,6 @@ def engines(settings: Settings) -> None:
     ),
     settings,
   )
-
-
-def _patches(barrier: bool, cones: bool) -> contextlib.ExitStack:
-  """Stock MJX, or what is asked for of ``sim.mjx_patches``."""
-  body_tree = "_guarded_body_tree" if barrier else "_stock_body_tree"
-  gradient = "_update_gradient" if cones else "_stock_update_gradient"
-  stack = contextlib.ExitStack()
-  for module, name, chosen in (
-    (mjx_scan, "body_tree", body_tree),
-    (mjx_solver, "_update_gradient", gradient),
-  ):
-    stack.enter_context(mock.patch.object(module, name, getattr(mjx_patches, chosen)))
-  return stack
 
 
 def raycaster(settings: Settings) -> None:

@@ -160,7 +160,6 @@ def main(settings: dict[str, Any]) -> None:
     after = update(now["state"], jax.random.key(now["calls"]))
     now.update(state=jax.block_until_ready(after), calls=now["calls"] + 1)
 
-  run()
   versions = {"version": brax.__version__, "backend": jax.default_backend()}
   sides.serve({"updates": sides.rate_of(run, 1)}, **versions)
 

@@ -1,15 +1,19 @@
-"""This project's sides of peers.py: worlds of an engine, or the learner of a row."""
+"""This project's sides of peers.py: worlds of an engine, or the learner of a row.
+
+Each compiles at its first measurement, which does not count.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+import contextlib
 import dataclasses
 import json
 import sys
 from typing import Any
-from unittest import mock
 
 import apnpql_jax  # noqa: F401  isort: skip  (before JAX: sets threads and cache)
+from cures import cures
 import jax
 import jax.numpy as jnp
 from peer_worlds import EPISODE_STEPS
@@ -18,7 +22,7 @@ import tables
 
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config import AgentConfig, EnvConfig
-from apnpql_jax.env import Env, EnvState, make_env
+from apnpql_jax.env import EnvState, make_env
 from apnpql_jax.presets import load_preset
 from apnpql_jax.rollout import rollout
 from apnpql_jax.types import Array
@@ -26,34 +30,34 @@ from apnpql_jax.types import Array
 sys.path.append(str(tables.ROOT / "tests"))
 from batches import random_batch  # noqa: E402  (the noise that the tests use)
 
-PERIODS = 4
-"""Control periods per call."""
-
 
 def worlds(settings: dict[str, Any]) -> dict[str, sides.Measure]:
-  """Control steps of all worlds: whole, or physics only; stock MJX has no cures."""
+  """Control steps of all worlds: whole, or physics only."""
   config = EnvConfig(
     task=settings["task"], backend=settings["backend"], worlds=settings["worlds"]
   )
-  if settings["stock"]:
-    with mock.patch("apnpql_jax.sim.mjx.patch_mjx"):
-      env = make_env(config)
-  else:
-    env = make_env(config)
+  periods = settings["periods"]  # Per call.
+  env = make_env(config)
   start = jax.jit(env.reset)(jnp.arange(config.worlds) % env.bank_split)
 
   @jax.jit
   def whole(state: EnvState, key: Array) -> EnvState:
-    return rollout(env, _random_policy, state, key, length=PERIODS)[0]
+    return rollout(env, _random_policy, state, key, length=periods)[0]
+
+  def period(state: Any, key: Array) -> tuple[Any, None]:
+    action = _random_actions(key, config.worlds)
+    return env.physics.step(state, action[:, :6], action[:, 6]), None
 
   @jax.jit
   def physics(state: Any, key: Array) -> Any:
-    return _physics(env, state, key)
+    stock = cures(barrier=False, cones=False)
+    with stock if settings["stock"] else contextlib.nullcontext():
+      return jax.lax.scan(period, state, jax.random.split(key, periods))[0]
 
-  measures = {"physics": _periods(physics, start.physics, config.worlds)}
-  if not settings["stock"]:  # Kinematics for the cameras would need the cures too.
-    measures["cameras"] = _periods(whole, start, config.worlds)
-  return measures
+  return {
+    "cameras": _played(whole, start, periods, config.worlds),
+    "physics": _played(physics, start.physics, periods, config.worlds),
+  }
 
 
 def learner(settings: dict[str, Any]) -> dict[str, sides.Measure]:
@@ -75,7 +79,6 @@ def learner(settings: dict[str, Any]) -> dict[str, sides.Measure]:
   def run() -> None:
     jax.block_until_ready(updates(state, jax.random.key(1)))
 
-  run()
   return {"updates": sides.rate_of(run, count)}
 
 
@@ -102,28 +105,19 @@ def _random_actions(key: Array, count: int) -> Array:
   return draws.at[:, 6].set((draws[:, 6] > 0).astype(jnp.float32))
 
 
-def _physics(env: Env, state: Any, key: Array) -> Any:
-  def period(state: Any, key: Array) -> tuple[Any, None]:
-    action = _random_actions(key, state.qpos.shape[0])
-    return env.physics.step(state, action[:, :6], action[:, 6]), None
-
-  return jax.lax.scan(period, state, jax.random.split(key, PERIODS))[0]
-
-
-def _periods(
-  advance: Callable[[Any, Array], Any], start: Any, count: int
+def _played(
+  advance: Callable[[Any, Array], Any], start: Any, periods: int, count: int
 ) -> sides.Measure:
   """Plays on from call to call, and from the start again after an episode."""
   now = {"state": start, "calls": 0}
 
   def run() -> None:
     key = jax.random.key(now["calls"])
-    again = now["calls"] % (EPISODE_STEPS // PERIODS) == 0
+    again = now["calls"] % (EPISODE_STEPS // periods) == 0
     state = advance(start if again else now["state"], key)
     now.update(state=jax.block_until_ready(state), calls=now["calls"] + 1)
 
-  run()  # Compiles.
-  return sides.rate_of(run, PERIODS * count)
+  return sides.rate_of(run, periods * count)
 
 
 def main(settings: dict[str, Any]) -> None:

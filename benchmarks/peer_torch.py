@@ -296,8 +296,6 @@ def main(settings: dict[str, Any]) -> None:
     policy_samples=settings["candidates"],
   )
   learner, batch = Learner(config, device), random_batch(settings["batch"], device)
-  for _ in range(3):
-    learner.update(batch)
   measure = sides.rate_of(lambda: learner.update(batch), 1)
   sides.serve({"updates": measure}, version=torch.__version__, device=device)
 

@@ -60,8 +60,9 @@ class Peer:
   """It needs a graphics library for MuJoCo."""
 
 
-_WORLDS = {"side": "worlds", "backend": "auto", "stock": False}
-_MJX = _WORLDS | {"backend": "mjx"}
+_WORLDS = {"side": "worlds", "backend": "auto", "stock": False, "periods": 4}
+# Little of it: on a CPU, stock MJX needs seconds for a control period of a few worlds.
+_MJX = _WORLDS | {"backend": "mjx", "periods": 1, "worlds": 16}
 
 PEERS = {
   "pybullet": Peer(
@@ -88,7 +89,7 @@ PEERS = {
     draws=True,
   ),
   "mjx": Peer(
-    "mujoco.mjx as it is installed, against this project's MJX engine",
+    f"mujoco.mjx as it is installed, against our MJX engine; {_MJX['worlds']} worlds",
     "peer_ours.py",
     ("physics",),
     _MJX,

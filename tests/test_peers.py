@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from cures import cures
 import jax
 import mujoco
+from mujoco.mjx._src import scan, solver
 import numpy as np
 import peer_mujoco
 from peer_worlds import World
@@ -12,6 +14,7 @@ import sides
 import urdf
 
 from apnpql_jax.presets import load_preset
+from apnpql_jax.sim import mjx_patches
 from apnpql_jax.tasks import make_task, task_names
 
 CAMERAS = {"global": (72, 96), "wrist": (36, 64)}
@@ -94,6 +97,15 @@ def test_mujoco_peer_is_the_native_engine(task, engines, resets):
       env.step(command, images=False)
   found = np.stack([env.data.qpos for env in envs])
   np.testing.assert_allclose(found, state.qpos, atol=1e-3)
+
+
+def test_stock_mjx_is_stock_while_it_is_traced():
+  mjx_patches.patch_mjx()
+  ours = scan.body_tree, solver._update_gradient
+  stock = mjx_patches._stock_body_tree, mjx_patches._stock_update_gradient
+  with cures(barrier=False, cones=False):
+    assert (scan.body_tree, solver._update_gradient) == stock
+  assert (scan.body_tree, solver._update_gradient) == ours != stock
 
 
 def test_urdf_refuses_what_it_cannot_express():
