@@ -541,7 +541,7 @@ def _train_until(until: float, program: Any, state: Any, config: TrainConfig) ->
         updates=int(state.learner.step),
         steps_per_s=int(state.env_steps) / (time.time() - began),
         success_rate=successes / max(successes + timeouts, 1),
-        losses={k: float(v) for k, v in metrics.items() if k.startswith("loss/")},
+        skipped_updates=int(metrics["faults/updates"]),
       )
       reported, successes, timeouts = now, 0, 0
   emit(
