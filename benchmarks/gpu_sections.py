@@ -29,6 +29,7 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 import numpy as np
+from peer_ours import random_policy
 
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.cameras import make_cameras
@@ -47,7 +48,10 @@ from apnpql_jax.rollout import agent_policy, rollout
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.tasks import make_task
-from apnpql_jax.types import Array, Observation, Transition
+from apnpql_jax.types import Array, Transition
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+from batches import random_batch  # noqa: E402  (the noise that the tests use)
 
 Settings = dict[str, Any]
 PRECISIONS = ("highest", "tensorfloat32")
@@ -306,7 +310,7 @@ def learner(settings: Settings) -> None:
     return jax.lax.scan(one, state, jax.random.split(key, updates))
 
   def args(size: int) -> tuple[Any, ...]:
-    batch = _noise(size)
+    batch = random_batch(0, size, pixels=True)
     state = agent.init(jax.random.key(0), batch.observation_tm1)
     return state, batch, jax.random.key(1)
 
@@ -314,7 +318,7 @@ def learner(settings: Settings) -> None:
     # A function of its own, for what has been traced once is not traced again.
     run = functools.partial(many)
     with jax.default_matmul_precision(precision):
-      return jax.jit(run).lower(*jax.eval_shape(functools.partial(args, size)))
+      return jax.jit(run).lower(*args(size))
 
   measure_all(
     (
@@ -342,39 +346,6 @@ def agent_config(settings: Settings) -> AgentConfig:
   )
 
 
-def _noise(size: int) -> Transition:
-  """A batch of random transitions."""
-  keys = iter(jax.random.split(jax.random.key(2), 8))
-  config = EnvConfig()
-
-  def observation() -> Observation:
-    def image(height: int, width: int) -> Array:
-      return jax.random.bits(next(keys), (size, height, width, 3), jnp.uint8)
-
-    return Observation(
-      robot=jax.random.normal(next(keys), (size, 21)),
-      tool=jnp.zeros((size, 3)),
-      global_image=image(*config.global_size),
-      wrist_image=image(*config.wrist_size),
-    )
-
-  return Transition(
-    observation_tm1=observation(),
-    action_tm1=random_action(next(keys), size),
-    reward_t=jnp.zeros(size),
-    discount_t=jnp.ones(size),
-    observation_t=observation(),
-    primitives_tm1=jnp.zeros((size, 3, 7)),
-    weight=jnp.ones(size),
-  )
-
-
-def random_action(key: Array, count: int) -> Array:
-  """f32[count, 7]."""
-  draws = jax.random.uniform(key, (count, 7), minval=-1.0)
-  return draws.at[:, 6].set((draws[:, 6] > 0).astype(jnp.float32))
-
-
 def worlds(settings: Settings) -> None:
   """Environment steps with both cameras of one task, by the number of worlds."""
   config = EnvConfig(
@@ -383,10 +354,9 @@ def worlds(settings: Settings) -> None:
   env = make_env(config)
 
   def step(carry: tuple[EnvState, Array]) -> tuple[tuple[EnvState, Array], None]:
-    state, key = carry
-    key, action_key = jax.random.split(key)
-    action = random_action(action_key, state.elapsed.shape[0])
-    return (env.step(state, action, key), key), None
+    key, play_key = jax.random.split(carry[1])
+    state, _ = rollout(env, random_policy, carry[0], play_key, length=1)
+    return (state, key), None
 
   def start(rows: Array) -> tuple[EnvState, Array]:
     return env.reset(rows), jax.random.key(0)
@@ -460,8 +430,8 @@ def rates(settings: Settings) -> None:
 
   key = jax.random.key(0)
   # Copies, because the iteration is given the state itself and takes it apart.
-  params, worlds = jax.tree.map(jnp.copy, (state.learner.params, state.env))
-  acting, playing = (params, worlds.timestep.observation, key), (worlds, params, key)
+  params, begun = jax.tree.map(jnp.copy, (state.learner.params, state.env))
+  acting, playing = (params, begun.timestep.observation, key), (begun, params, key)
   items = [
     Item("policy", lambda: jax.jit(act).lower(*acting), lambda: acting, count),
     Item(

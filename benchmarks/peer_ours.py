@@ -42,10 +42,10 @@ def worlds(settings: dict[str, Any]) -> dict[str, sides.Measure]:
 
   @jax.jit
   def whole(state: EnvState, key: Array) -> EnvState:
-    return rollout(env, _random_policy, state, key, length=periods)[0]
+    return rollout(env, random_policy, state, key, length=periods)[0]
 
   def period(state: Any, key: Array) -> tuple[Any, None]:
-    action = _random_actions(key, config.worlds)
+    action = random_actions(key, config.worlds)
     return env.physics.step(state, action[:, :6], action[:, 6]), None
 
   @jax.jit
@@ -95,12 +95,14 @@ def learner_config(settings: dict[str, Any]) -> AgentConfig:
   )
 
 
-def _random_policy(state: EnvState, key: Array) -> tuple[Array, Array]:
+def random_policy(state: EnvState, key: Array) -> tuple[Array, Array]:
+  """Any action is as likely as any other, as a ``rollout.Policy``."""
   count = state.elapsed.shape[0]
-  return _random_actions(key, count), jnp.zeros(count)
+  return random_actions(key, count), jnp.zeros(count)
 
 
-def _random_actions(key: Array, count: int) -> Array:
+def random_actions(key: Array, count: int) -> Array:
+  """f32[count, 7]."""
   draws = jax.random.uniform(key, (count, 7), minval=-1.0)
   return draws.at[:, 6].set((draws[:, 6] > 0).astype(jnp.float32))
 
