@@ -8,7 +8,7 @@ the compilations up to a moment that the suite sets ("quiet" tells whether they 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 import concurrent.futures
 import contextlib
 import dataclasses
@@ -155,7 +155,7 @@ def memory(program: Any) -> dict[str, float]:
 
 
 @contextlib.contextmanager
-def measuring(settings: Settings) -> Iterator[bool]:
+def measuring(settings: Settings) -> Generator[bool, None, None]:
   """The device for oneself; true if nobody compiles meanwhile."""
   with _lock(settings, "compile", until=settings["compile_until"]) as quiet:
     with _lock(settings, "device"):
@@ -165,7 +165,7 @@ def measuring(settings: Settings) -> Iterator[bool]:
 @contextlib.contextmanager
 def _lock(
   settings: Settings, name: str, *, shared: bool = False, until: float | None = None
-) -> Iterator[bool]:
+) -> Generator[bool, None, None]:
   """A lock between processes and threads; false if it was not free ``until`` then."""
   kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
   with (Path(settings["folder"]) / name).open("w") as file:
@@ -418,7 +418,7 @@ def rates(settings: Settings) -> None:
   env, agent = make_env(config.env), make_agent(config.agent)
   # An expert's replay that is empty is sampled at the same cost.
   state = initial_state(config, env, agent, empty_expert)
-  iteration = make_iteration(config, env, agent)
+  iteration: Any = make_iteration(config, env, agent)
   steps = config.rollout_length * count
 
   def play(state: EnvState, params: Any, key: Array) -> tuple[EnvState, Array]:
@@ -458,8 +458,8 @@ def train(settings: Settings) -> None:
   config = gpu_config(settings, settings["train_worlds"])
   episodes = settings["eval_episodes"]
   env, agent = make_env(config.env), make_agent(config.agent)
-  iteration = make_iteration(config, env, agent)
-  play = make_player(env, lambda params: agent_policy(agent, params, greedy=False))
+  iteration: Any = make_iteration(config, env, agent)
+  play: Any = make_player(env, lambda params: agent_policy(agent, params, greedy=False))
   example = jax.eval_shape(lambda: initial_state(config, env, agent, empty_expert))
   rows, key = jnp.zeros(episodes, jnp.int32), jax.random.key(0)
 
