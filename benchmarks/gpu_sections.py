@@ -488,8 +488,9 @@ def train(settings: Settings) -> None:
     compile_from_cache_s=from_cache_s,
     **memory(program),
   )
-  until = json.loads(sys.stdin.readline())["until"]
+  terms = json.loads(sys.stdin.readline())
   with measuring(settings):
+    until = min(time.time() + terms["seconds"], terms["until"])
     state = _train_until(until, program, state, config)
     began = time.perf_counter()
     figures = play_held_out(env, play, state.learner.params, episodes=episodes, seed=0)

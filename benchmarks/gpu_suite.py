@@ -133,11 +133,11 @@ class Running:
     self._reader = threading.Thread(target=self._read)
     self._reader.start()
 
-  def go(self, until: float) -> None:
-    """Lets a section that waits for it begin; it has until then."""
+  def go(self, **terms: float) -> None:
+    """Lets a section that waits for it begin, on these terms."""
     assert self._process.stdin is not None
     with contextlib.suppress(BrokenPipeError):
-      self._process.stdin.write(f"{json.dumps({'until': until})}\n".encode())
+      self._process.stdin.write(f"{json.dumps(terms)}\n".encode())
       self._process.stdin.flush()
 
   @property
@@ -235,7 +235,7 @@ def _run_all(
       print(f"{name}: skipped", flush=True)
     if training:
       trainer = trainer or start("train")
-      trainer.go(min(time.time() + args.train, end - AFTER_TRAINING_S))
+      trainer.go(seconds=args.train, until=end - AFTER_TRAINING_S)
       trainer.finish(end)
   finally:
     for section in filter(None, [*running, trainer]):
