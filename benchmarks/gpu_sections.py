@@ -235,16 +235,17 @@ def engines(settings: Settings) -> None:
     put = mjx.put_model(model, impl=impl)
     data = mjx.make_data(model, impl=impl, **(sizes if impl == "warp" else {}))
 
-    def world(qpos: Array) -> Array:
-      def step(data: Any, _: None) -> tuple[Any, None]:
-        return mjx.step(put, data), None
+    def period(qpos: Array) -> Array:
+      def step(worlds: Any, _: None) -> tuple[Any, None]:
+        # Warp knows its worlds as a batch: the scan must be around them.
+        return jax.vmap(mjx.step, in_axes=(None, 0))(put, worlds), None
 
-      start = data.replace(qpos=qpos)
-      return jax.lax.scan(step, start, None, length=substeps)[0].qpos
+      worlds = jax.vmap(lambda qpos: data.replace(qpos=qpos))(qpos)
+      return jax.lax.scan(step, worlds, None, length=substeps)[0].qpos
 
     chosen = cures(barrier=barrier, cones=cones)
     with chosen, jax.default_matmul_precision(precision):
-      return jax.jit(jax.vmap(world)).lower(qpos)
+      return jax.jit(period).lower(qpos)
 
   def differs(qpos: Array) -> dict[str, Any]:
     finite = bool(jnp.isfinite(qpos).all())
