@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 
+import gpu_sections
 import gpu_suite
+
+from apnpql_jax.tasks import task_names
 
 
 def run(tmp_path, *args: str) -> dict:
@@ -12,6 +15,12 @@ def run(tmp_path, *args: str) -> dict:
   out = tmp_path / "report.json"
   gpu_suite.main(["--quick", "--jobs", "1", "--out", str(out), *args])
   return json.loads(out.read_text())["sections"]
+
+
+def test_it_knows_all_tasks_and_sections():
+  assert set(gpu_suite.TASKS) == set(task_names())
+  known = {name.partition("/")[0] for name in gpu_suite.SECTIONS}
+  assert known == set(gpu_sections.SECTIONS)
 
 
 def test_figures_are_in_the_report(tmp_path):
