@@ -244,7 +244,7 @@ def _run_all(
 
 def _environment(args: argparse.Namespace, folder: Path) -> dict[str, str]:
   """The environment of the sections."""
-  paths = [str(folder / "site"), str(FOLDER.parent), os.environ.get("PYTHONPATH", "")]
+  paths = [str(FOLDER.parent), str(folder / "site"), os.environ.get("PYTHONPATH", "")]
   env = os.environ | {
     "PYTHONPATH": os.pathsep.join(filter(None, paths)),
     # Sections share the device.
