@@ -2,6 +2,7 @@
 
   python benchmarks/gpu_suite.py --out gpu.json --wheels wheels
   python benchmarks/gpu_suite.py --out quick.json --quick        # tiny, on a CPU
+  python benchmarks/gpu_suite.py --store gpu.json   # keeps it, and its table in docs/
 
 Engines (MJX with and without its cures, Warp), layouts of the ray caster, precision of
 matrix products, 256 to 8,192 worlds of each task, policy and learner, compilation,
@@ -13,7 +14,7 @@ Needs a checkout and no network: what is not installed is taken from ``--wheels`
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 import contextlib
 import json
 import os
@@ -97,21 +98,18 @@ class Report:
 
   def __init__(self, path: Path, **header: Any):
     self._path, self._lock = path, threading.Lock()
-    self._content: dict[str, Any] = {"benchmark": "gpu_suite", **header, "sections": {}}
+    self.content: dict[str, Any] = {"benchmark": "gpu_suite", **header, "sections": {}}
 
   def put(self, section: str, **fields: Any) -> None:
     """Sets fields of a section; a ``result`` joins its results."""
     with self._lock:
-      entry = self._content["sections"].setdefault(section, {"results": []})
+      entry = self.content["sections"].setdefault(section, {"results": []})
       if (result := fields.pop("result", None)) is not None:
         entry["results"].append(result)
       entry.update(fields)
       beside = self._path.with_suffix(".part")
-      beside.write_text(json.dumps(self._content, indent=2, default=str) + "\n")
+      beside.write_text(json.dumps(self.content, indent=2, default=str) + "\n")
       beside.replace(self._path)
-
-  def __getitem__(self, section: str) -> dict[str, Any]:
-    return self._content["sections"][section]
 
 
 class Running:
@@ -163,7 +161,7 @@ class Running:
       self._said.seek(0)
       said = self._said.read().decode(errors="replace").strip().splitlines()
       status = f"failed: {said[-1] if said else self._process.returncode}"
-    entry = self._report[self.name]
+    entry = self._report.content["sections"][self.name]
     there = {result["what"] for result in entry["results"]}
     missing = [what for what in entry.get("plan", []) if what not in there]
     seconds = time.time() - self._began
@@ -184,6 +182,9 @@ class Running:
 def main(argv: Sequence[str] | None = None) -> None:
   """Command line; see the module's docstring."""
   args = _arguments(argv)
+  if args.store:
+    store(args.store)
+    return
   began = time.time()
   folder = Path(tempfile.mkdtemp(prefix="gpu_suite_"))
   try:
@@ -194,9 +195,37 @@ def main(argv: Sequence[str] | None = None) -> None:
       sys.exit(problem)
     report.put("prepare", status="done", seconds=time.time() - began)
     _run_all(args, folder, env, report, end=began + args.budget)
-    report.put("suite", seconds=time.time() - began)
+    report.put("suite", status="done", seconds=time.time() - began)
   finally:
     shutil.rmtree(folder, ignore_errors=True)
+
+
+def store(path: Path) -> None:
+  """Keeps a report in ``benchmarks/results``, and its table in docs/performance.md."""
+  import tables  # Needs what may have to be taken from the wheels elsewhere.
+
+  report = json.loads(path.read_text())
+  tables.store("gpu_suite", report)
+  head = ("section", "figure", "per second", "", "compile s", "GiB", "note")
+  tables.put("gpu", f"Commit {report['commit']}.\n\n{tables.table(head, rows(report))}")
+
+
+def rows(report: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
+  """A line for every figure, and for what there is none of."""
+  for name, entry in report["sections"].items():
+    for result in entry["results"]:
+      note = result.get("error", "" if result.get("quiet", True) else "others compiled")
+      if "success_rate" in result:
+        note = f"{100 * result['success_rate']:.0f} % of episodes solved"
+      unit = next((key for key in result if key.endswith("_per_s")), None)
+      figure = (unit.removesuffix("_per_s"), result[unit]) if unit else ("", "")
+      size = result.get("program_gib", "")
+      compile_s = result.get("compile_s", "")
+      yield name, result["what"], figure[1], figure[0], compile_s, size, note
+    for what in entry.get("missing", ()):
+      yield name, what, "", "", "", "", entry["status"]
+    if not entry["results"] and entry.get("status") != "done":
+      yield name, "", "", "", "", "", entry.get("status", "")
 
 
 def _run_all(
@@ -294,6 +323,7 @@ def _commit() -> str:
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
   parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
   parser.add_argument("--out", type=Path, default=Path("gpu_suite.json"))
+  parser.add_argument("--store", type=Path, help="keep this report; measures nothing")
   parser.add_argument("--wheels", type=Path, help="folder of what is not installed")
   parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
   parser.add_argument("--sections", nargs="+", choices=SECTIONS, default=SECTIONS)

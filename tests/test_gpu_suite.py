@@ -30,6 +30,8 @@ def test_figures_are_in_the_report(tmp_path):
   assert set(section["plan"]) < set(found)
   assert found["copy"]["gib_per_s"] > 0 and found["copy"]["quiet"]
   assert found["product float32"]["compile_s"] > 0
+  lines = list(gpu_suite.rows({"sections": {"device": section}}))
+  assert [line[1] for line in lines] == list(found)
 
 
 def test_what_does_not_fit_into_the_budget_is_named(tmp_path):
@@ -48,6 +50,8 @@ def test_a_section_that_fails_or_is_late_keeps_its_place(tmp_path):
   ]
   running[1].finish(deadline=0.0)
   running[0].finish(deadline=float("inf"))
-  assert report["device"]["status"] == "stopped: its time was over"
-  assert report["worlds/nothing"]["status"].startswith("failed: ")
-  assert "nothing" in report["worlds/nothing"]["status"]
+  sections = report.content["sections"]
+  assert sections["device"]["status"] == "stopped: its time was over"
+  assert sections["worlds/nothing"]["status"].startswith("failed: ")
+  lines = {line[0]: line[-1] for line in gpu_suite.rows(report.content)}
+  assert "nothing" in lines["worlds/nothing"]
