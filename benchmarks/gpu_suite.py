@@ -30,6 +30,7 @@ from typing import Any
 
 FOLDER = Path(__file__).resolve().parent
 SCRIPT = FOLDER / "gpu_sections.py"
+CORES = os.cpu_count() or 1
 AFTER_TRAINING_S = 30.0
 """Kept for the episodes that are played after training."""
 
@@ -238,7 +239,8 @@ def _run_all(
   measured = end - tail
   settings = (QUICK if args.quick else FULL) | {
     "folder": str(folder),
-    "threads": max(1, (os.cpu_count() or 1) // args.jobs),
+    # Twice as many programs at once as cores: much of a compilation is tracing.
+    "threads": max(1, 2 * CORES // min(args.jobs, len(args.sections))),
     # Half of the time may pass in waiting for others to compile.
     "compile_until": (time.time() + measured) / 2,
   }
@@ -332,7 +334,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
   parser.add_argument(
     "--jobs",
     type=int,
-    default=max(1, (os.cpu_count() or 1) // 2),
+    default=CORES,
     help="sections that compile at once; figures come one at a time",
   )
   args = parser.parse_args(argv)
