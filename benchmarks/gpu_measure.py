@@ -25,7 +25,7 @@ import jax
 
 Settings = dict[str, Any]
 SLOW_S = 5.0
-"""A repeat that takes longer is the only one."""
+"""A repeat that takes longer is the last one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,15 +63,25 @@ def measure_all(items: Iterable[Item], settings: Settings) -> None:
   emit(plan=[item.what for item in items])
   tracing = threading.Lock()
 
-  def build(item: Item) -> tuple[Any, Any, dict[str, float]]:
+  def build(item: Item) -> tuple[Any, list[Any], dict[str, float]]:
     with lock(settings, "compile", shared=True):
       with tracing:
         began = time.perf_counter()
         lowered = item.lower()
         traced = time.perf_counter()
-      program = lowered.compile()
-      seconds = {"trace_s": traced - began, "compile_s": time.perf_counter() - traced}
-      return program, item.args(), seconds
+      program, compiled = lowered.compile(), time.perf_counter()
+      args = list(item.args())
+      began_call = time.perf_counter()
+      out = jax.block_until_ready(program(*args))
+      if item.carry:
+        args[0] = out[0]
+      seconds = {
+        "trace_s": traced - began,
+        "compile_s": compiled - traced,
+        # Warp compiles here, and the first call is slower than the others anyway.
+        "first_call_s": time.perf_counter() - began_call,
+      }
+      return program, args, seconds
 
   with concurrent.futures.ThreadPoolExecutor(settings["threads"]) as pool:
     futures = {pool.submit(build, item): item for item in items}
@@ -80,7 +90,7 @@ def measure_all(items: Iterable[Item], settings: Settings) -> None:
       try:
         program, args, seconds = future.result()
         with measuring(settings) as quiet:
-          figures = _measure(item, program, list(args), settings)
+          figures = _measure(item, program, args, settings)
         emit(what=item.what, quiet=quiet, **seconds, **figures)
       except Exception as error:  # One figure must not cost the others.
         reason = (str(error).splitlines() or [""])[0][:300]
@@ -91,15 +101,14 @@ def _measure(
   item: Item, program: Any, args: list[Any], settings: Settings
 ) -> dict[str, Any]:
   rates = []
-  for repeat in range(1 + settings["repeats"]):
+  for _ in range(settings["repeats"]):
     calls, began = 0, time.perf_counter()
     while (spent := time.perf_counter() - began) < settings["seconds"] or not calls:
       out = jax.block_until_ready(program(*args))
       if item.carry:
         args[0] = out[0]
       calls += 1
-    if repeat or spent > SLOW_S:  # The first calls are slower than those that follow.
-      rates.append(calls * item.per_call / spent)
+    rates.append(calls * item.per_call / spent)
     if spent > SLOW_S:
       break
   name = f"{item.unit}_per_s"
