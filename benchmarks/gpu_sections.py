@@ -1,0 +1,288 @@
+"""The sections of gpu_suite.py, each run in a process of its own.
+
+  python benchmarks/gpu_sections.py SECTION SETTINGS
+
+A section says first what it is going to measure, see ``gpu_measure``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import functools
+import json
+from pathlib import Path
+import sys
+from typing import Any
+from unittest import mock
+
+import apnpql_jax  # isort: skip  (before JAX: sets threads and cache)
+from cures import cures
+from gpu_measure import Item, Settings, emit, measure_all
+import gpu_training
+import jax
+import jax.numpy as jnp
+from mujoco import mjx
+import numpy as np
+from peer_ours import random_policy
+
+from apnpql_jax.agents.learner import make_agent
+from apnpql_jax.cameras import make_cameras
+from apnpql_jax.config import EnvConfig
+from apnpql_jax.env import EnvState, make_env
+from apnpql_jax.iteration import empty_expert, initial_state, make_iteration
+from apnpql_jax.render import raycast
+from apnpql_jax.rollout import agent_policy, rollout
+from apnpql_jax.sim import physics
+from apnpql_jax.sim.kinematics import make_kinematics
+from apnpql_jax.tasks import make_task
+from apnpql_jax.types import Array, Transition
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+from batches import random_batch  # noqa: E402  (the noise that the tests use)
+
+PRECISIONS = ("highest", "tensorfloat32")
+
+
+def device(settings: Settings) -> None:
+  """What the device can do: matrix products by precision, and moving memory."""
+  stats = jax.local_devices()[0].memory_stats() or {}
+  emit(
+    what="device",
+    kind=jax.devices()[0].device_kind,
+    backend=jax.default_backend(),
+    versions={m.__name__: m.__version__ for m in (jax, apnpql_jax)},
+    memory_gib=stats.get("bytes_limit", 0) / 2**30,
+  )
+  size = settings["matrix"]
+  matrix = jnp.ones((size, size))
+
+  def product(precision: str, dtype: Any) -> Callable[[], Any]:
+    def lower() -> Any:
+      with jax.default_matmul_precision(precision):
+        return jax.jit(jnp.dot).lower(matrix.astype(dtype), matrix.astype(dtype))
+
+    return lower
+
+  tera = 2 * size**3 / 1e12
+  kinds = {"float32": "highest", "tf32": "tensorfloat32", "bfloat16": "bfloat16"}
+  items = []
+  for name, precision in kinds.items():
+    dtype = jnp.bfloat16 if name == "bfloat16" else jnp.float32
+    pair = functools.partial(lambda dtype: (matrix.astype(dtype),) * 2, dtype)
+    items.append(
+      Item(f"product {name}", product(precision, dtype), pair, tera, "teraflop")
+    )
+  flat = matrix.reshape(-1)
+  copy = functools.partial(jax.jit(lambda x: x + 1.0).lower, flat)
+  giga = 2 * flat.nbytes / 2**30
+  items.append(Item("copy", copy, lambda: (flat,), giga, "gib"))
+  measure_all(items, settings)
+
+
+def engines(settings: Settings) -> None:
+  """A control period of plain ``mjx.step`` on push_plate: cures, precision, Warp.
+
+  Each final state is compared with that of the variant that was measured first.
+  """
+  count, reference = settings["engine_worlds"], {}
+  task, substeps = make_task("push_plate"), settings["substeps"]
+  model = task.scene.model
+  draw = task.sample_resets(np.random.default_rng(0), count)
+  qpos = jnp.asarray(draw.qpos, jnp.float32)
+
+  def lower(impl: str, barrier: bool, cones: bool, precision: str) -> Any:
+    kept = mjx.make_data(model, impl="jax")._impl
+    sizes = {"naconmax": count * kept.ncon, "njmax": kept.nefc}
+    put = mjx.put_model(model, impl=impl)
+    data = mjx.make_data(model, impl=impl, **(sizes if impl == "warp" else {}))
+
+    def period(qpos: Array) -> Array:
+      def step(worlds: Any, _: None) -> tuple[Any, None]:
+        # Warp knows its worlds as a batch: the scan must be around them.
+        return jax.vmap(mjx.step, in_axes=(None, 0))(put, worlds), None
+
+      worlds = jax.vmap(lambda qpos: data.replace(qpos=qpos))(qpos)
+      return jax.lax.scan(step, worlds, None, length=substeps)[0].qpos
+
+    chosen = cures(barrier=barrier, cones=cones)
+    with chosen, jax.default_matmul_precision(precision):
+      return jax.jit(period).lower(qpos)
+
+  def differs(qpos: Array) -> dict[str, Any]:
+    finite = bool(jnp.isfinite(qpos).all())
+    first = reference.setdefault("qpos", np.asarray(qpos))
+    return {"finite": finite, "qpos_differs": float(np.abs(qpos - first).max())}
+
+  variants = {
+    "jax, cones": ("jax", False, True, "highest"),
+    "jax, barrier and cones": ("jax", True, True, "highest"),
+    "jax, barrier": ("jax", True, False, "highest"),
+    "jax, stock": ("jax", False, False, "highest"),
+    "jax, cones, TF32": ("jax", False, True, "tensorfloat32"),
+    "warp": ("warp", False, False, "highest"),
+  }
+  measure_all(
+    (
+      Item(
+        name,
+        functools.partial(lower, *variants[name]),
+        lambda: (qpos,),
+        count,
+        look=differs,
+      )
+      for name in settings["engines"]
+    ),
+    settings,
+  )
+
+
+def raycaster(settings: Settings) -> None:
+  """Pairs of images by the layout of the pixels, with shadows and with textures."""
+  count, task = settings["render_worlds"], make_task("push_plate")
+  draw = task.sample_resets(np.random.default_rng(0), count)
+  state = physics.initial_state(task.scene, *map(jnp.asarray, draw))
+  seen = jax.jit(make_kinematics(task.scene))(state)
+
+  def lower(blocks: int, shadows: bool) -> Any:
+    cameras = make_cameras(EnvConfig(shadows=shadows), task.scene)
+    with mock.patch.object(raycast, "BLOCKS", blocks):
+      return jax.jit(lambda poses: [camera(poses) for camera in cameras]).lower(seen)
+
+  variants = {f"{n} blocks": (n, False) for n in settings["blocks"]}
+  variants["shadows"] = (raycast.BLOCKS, True)
+  measure_all(
+    (
+      Item(name, functools.partial(lower, *variant), lambda: (seen,), count, "pairs")
+      for name, variant in variants.items()
+    ),
+    settings,
+  )
+
+
+def learner(settings: Settings) -> None:
+  """Updates per second by batch and precision of matrix products."""
+  agent = make_agent(gpu_training.agent_config(settings))
+  updates = settings["updates"]
+
+  def many(state: Any, batch: Transition, key: Array) -> tuple[Any, Array]:
+    def one(state: Any, key: Array) -> tuple[Any, Array]:
+      state, metrics = agent.update(state, batch, key)
+      return state, metrics["loss/q"]
+
+    return jax.lax.scan(one, state, jax.random.split(key, updates))
+
+  def args(size: int) -> tuple[Any, ...]:
+    batch = random_batch(0, size, pixels=True)
+    state = agent.init(jax.random.key(0), batch.observation_tm1)
+    return state, batch, jax.random.key(1)
+
+  def lower(size: int, precision: str) -> Any:
+    with jax.default_matmul_precision(precision):
+      return jax.jit(many).lower(*args(size))
+
+  measure_all(
+    (
+      Item(
+        f"batch {size}, {precision}",
+        functools.partial(lower, size, precision),
+        functools.partial(args, size),
+        updates,
+        "updates",
+      )
+      for size in settings["batches"]
+      for precision in PRECISIONS
+    ),
+    settings,
+  )
+
+
+def worlds(settings: Settings) -> None:
+  """Environment steps with both cameras of one task, by the number of worlds."""
+  config = EnvConfig(
+    task=settings["task"], backend=settings["backend"], bank_rows=settings["bank_rows"]
+  )
+  env = make_env(config)
+
+  def step(carry: tuple[EnvState, Array]) -> tuple[tuple[EnvState, Array], None]:
+    key, play_key = jax.random.split(carry[1])
+    state, _ = rollout(env, random_policy, carry[0], play_key, length=1)
+    return (state, key), None
+
+  def start(rows: Array) -> tuple[EnvState, Array]:
+    return env.reset(rows), jax.random.key(0)
+
+  def args(count: int) -> tuple[Any]:
+    return (jax.jit(start)(jnp.arange(count) % env.bank_split),)
+
+  def lower(count: int) -> Any:
+    carry = jax.eval_shape(start, jax.ShapeDtypeStruct((count,), jnp.int32))
+    return jax.jit(step, donate_argnums=0).lower(carry)
+
+  measure_all(
+    (
+      Item(
+        f"{count} worlds",
+        functools.partial(lower, count),
+        functools.partial(args, count),
+        count,
+        carry=True,
+      )
+      for count in settings["worlds"]
+    ),
+    settings,
+  )
+
+
+def rates(settings: Settings) -> None:
+  """The policy alone, environment with policy, and a whole iteration."""
+  count = settings["rate_worlds"]
+  config = gpu_training.training_config(settings, count)
+  env, agent = make_env(config.env), make_agent(config.agent)
+  # An expert's replay that is empty is sampled at the same cost.
+  state = initial_state(config, env, agent, empty_expert)
+  iteration: Any = make_iteration(config, env, agent)
+  steps = config.rollout_length * count
+
+  def play(state: EnvState, params: Any, key: Array) -> tuple[EnvState, Array]:
+    policy = agent_policy(agent, params, greedy=False)
+    return rollout(env, policy, state, key, length=config.rollout_length)[0], key
+
+  def act(params: Any, observation: Any, key: Array) -> Array:
+    return agent.act(params, observation, key, False)[0]
+
+  key = jax.random.key(0)
+  # Copies, because the iteration is given the state itself and takes it apart.
+  params, begun = jax.tree.map(jnp.copy, (state.learner.params, state.env))
+  acting, playing = (params, begun.timestep.observation, key), (begun, params, key)
+  items = [
+    Item("policy", lambda: jax.jit(act).lower(*acting), lambda: acting, count),
+    Item(
+      "env and policy", lambda: jax.jit(play).lower(*playing), lambda: playing, steps
+    ),
+    Item(
+      f"env, policy and {config.updates_per_iteration} updates of batch "
+      f"{config.replay.batch_size} per {steps} steps",
+      lambda: iteration.lower(state),
+      lambda: (state,),
+      steps,
+      carry=True,
+    ),
+  ]
+  measure_all(items, settings)
+
+
+SECTIONS = {
+  "device": device,
+  "engines": engines,
+  "raycaster": raycaster,
+  "learner": learner,
+  "worlds": worlds,
+  "rates": rates,
+  "train": gpu_training.train,
+}
+
+
+if __name__ == "__main__":
+  # Without arguments it has been found that all imports are there.
+  if len(sys.argv) > 1:
+    SECTIONS[sys.argv[1]](json.loads(sys.argv[2]))

@@ -1,0 +1,132 @@
+"""This project's sides of peers.py: worlds of an engine, or the learner of a row.
+
+Each compiles at its first measurement, which does not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import contextlib
+import dataclasses
+import json
+import sys
+from typing import Any
+
+import apnpql_jax  # noqa: F401  isort: skip  (before JAX: sets threads and cache)
+from cures import cures
+import jax
+import jax.numpy as jnp
+from peer_worlds import EPISODE_STEPS
+import sides
+import tables
+
+from apnpql_jax.agents.learner import make_agent
+from apnpql_jax.config import AgentConfig, EnvConfig
+from apnpql_jax.env import EnvState, make_env
+from apnpql_jax.presets import load_preset
+from apnpql_jax.rollout import rollout
+from apnpql_jax.types import Array
+
+sys.path.append(str(tables.ROOT / "tests"))
+from batches import random_batch  # noqa: E402  (the noise that the tests use)
+
+
+def worlds(settings: dict[str, Any]) -> dict[str, sides.Measure]:
+  """Control steps of all worlds: whole, or physics only."""
+  config = EnvConfig(
+    task=settings["task"], backend=settings["backend"], worlds=settings["worlds"]
+  )
+  periods = settings["periods"]  # Per call.
+  env = make_env(config)
+  start = jax.jit(env.reset)(jnp.arange(config.worlds) % env.bank_split)
+
+  @jax.jit
+  def whole(state: EnvState, key: Array) -> EnvState:
+    return rollout(env, random_policy, state, key, length=periods)[0]
+
+  def period(state: Any, key: Array) -> tuple[Any, None]:
+    action = random_actions(key, config.worlds)
+    return env.physics.step(state, action[:, :6], action[:, 6]), None
+
+  @jax.jit
+  def physics(state: Any, key: Array) -> Any:
+    stock = cures(barrier=False, cones=False)
+    with stock if settings["stock"] else contextlib.nullcontext():
+      return jax.lax.scan(period, state, jax.random.split(key, periods))[0]
+
+  return {
+    "cameras": _played(whole, start, periods, config.worlds),
+    "physics": _played(physics, start.physics, periods, config.worlds),
+  }
+
+
+def learner(settings: dict[str, Any]) -> dict[str, sides.Measure]:
+  """Updates on a batch of noise, in a scan of as many as an iteration has."""
+  preset = load_preset(settings["preset"])
+  agent = make_agent(learner_config(settings))
+  count = preset.updates_per_iteration
+  batch = random_batch(0, settings["batch"], pixels=True)
+  state = agent.init(jax.random.key(0), batch.observation_tm1)
+
+  @jax.jit
+  def updates(state: Any, key: Array) -> Any:
+    def update(state: Any, key: Array) -> tuple[Any, Array]:
+      state, metrics = agent.update(state, batch, key)
+      return state, metrics["loss/q"]
+
+    return jax.lax.scan(update, state, jax.random.split(key, count))
+
+  def run() -> None:
+    jax.block_until_ready(updates(state, jax.random.key(1)))
+
+  return {"updates": sides.rate_of(run, count)}
+
+
+def learner_config(settings: dict[str, Any]) -> AgentConfig:
+  """The agent of the preset with the algorithm and the candidates asked for."""
+  config = load_preset(settings["preset"]).agent
+  return dataclasses.replace(
+    config,
+    algorithm=settings.get("algorithm", config.algorithm),
+    target_samples=settings["candidates"],
+    policy_samples=settings["candidates"],
+    # Epsilon must stay below the log of the candidates; it costs no time.
+    epsilon=min(config.epsilon, 1.0),
+  )
+
+
+def random_policy(state: EnvState, key: Array) -> tuple[Array, Array]:
+  """Any action is as likely as any other, as a ``rollout.Policy``."""
+  count = state.elapsed.shape[0]
+  return random_actions(key, count), jnp.zeros(count)
+
+
+def random_actions(key: Array, count: int) -> Array:
+  """f32[count, 7]."""
+  draws = jax.random.uniform(key, (count, 7), minval=-1.0)
+  return draws.at[:, 6].set((draws[:, 6] > 0).astype(jnp.float32))
+
+
+def _played(
+  advance: Callable[[Any, Array], Any], start: Any, periods: int, count: int
+) -> sides.Measure:
+  """Plays on from call to call, and from the start again after an episode."""
+  now = {"state": start, "calls": 0}
+
+  def run() -> None:
+    key = jax.random.key(now["calls"])
+    again = now["calls"] % (EPISODE_STEPS // periods) == 0
+    state = advance(start if again else now["state"], key)
+    now.update(state=jax.block_until_ready(state), calls=now["calls"] + 1)
+
+  return sides.rate_of(run, periods * count)
+
+
+def main(settings: dict[str, Any]) -> None:
+  """Serves what ``settings["side"]`` names."""
+  make = {"worlds": worlds, "learner": learner}[settings["side"]]
+  sides.serve(make(settings), backend=jax.default_backend())
+
+
+if __name__ == "__main__":
+  main(json.loads(sys.argv[1]))

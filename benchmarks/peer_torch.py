@@ -1,0 +1,304 @@
+"""AP-NPQL in plain PyTorch: the same networks, candidates, losses and optimisers.
+
+A side of peers.py. Eager mode, float32, all cores or the GPU, as most learners in
+PyTorch run. Features are computed once per observation and the first layer of Z is
+split, as here; distributions and convolutions are those of the library. Limits are
+plain clips, and the entropy of the prior is that of its components on average.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import json
+import math
+import sys
+from typing import Any
+
+import numpy as np
+import sides
+import torch
+from torch import nn
+from torch.distributions import Bernoulli, MultivariateNormal
+import torch.nn.functional as F
+
+from apnpql_jax.config import AgentConfig
+from apnpql_jax.presets import load_preset
+
+JOINTS, PRIMITIVES = 6, 3
+BELOW = JOINTS * (JOINTS - 1) // 2
+IMAGES = {"global": (72, 96), "wrist": (36, 64)}
+
+Batch = dict[str, torch.Tensor]
+
+
+class Camera(nn.Module):
+  """Two convolutions and the map's own projection."""
+
+  def __init__(self, config: AgentConfig, size: tuple[int, int]):
+    super().__init__()
+    first, second = config.patch_channels, config.conv_channels
+    height, width = (8 * math.ceil(side / 8) for side in size)
+    self.padding = (0, width - size[1], 0, height - size[0])
+    self.first = nn.Conv2d(3, first, 4, stride=4)
+    kernel = 3 if config.conv_overlap else 2
+    self.second = nn.Conv2d(first, second, kernel, stride=2, padding=kernel // 3)
+    cells = height * width // 64
+    self.project = nn.Linear(cells * second, config.feature_dim, bias=False)
+
+  def forward(self, image: torch.Tensor) -> torch.Tensor:
+    """u8[B, 3, H, W] -> f32[B, feature_dim]."""
+    x = F.pad(image.float() / 255.0, self.padding)
+    return self.project(F.relu(self.second(F.relu(self.first(x)))).flatten(1))
+
+
+class Encoder(nn.Module):
+  """Observation -> phi."""
+
+  def __init__(self, config: AgentConfig):
+    super().__init__()
+    sizes = IMAGES.items()
+    self.cameras = nn.ModuleDict({name: Camera(config, size) for name, size in sizes})
+    self.state = nn.Linear(33, config.feature_dim)
+    self.from_state = nn.Linear(config.feature_dim, config.feature_dim)
+    self.norm = nn.LayerNorm(config.feature_dim)
+
+  def forward(self, batch: Batch, time: str) -> torch.Tensor:
+    """f32[B, feature_dim]."""
+    robot = batch[f"robot_{time}"].unflatten(-1, (3, 7))
+    newest, changes = robot[:, -1], 7.0 * (robot[:, 1:] - robot[:, :-1])
+    joints = newest[:, :JOINTS]
+    state = [newest, joints.sin(), joints.cos(), changes.flatten(1)]
+    x = self.from_state(F.relu(self.state(torch.cat(state, -1))))
+    for name, camera in self.cameras.items():
+      x = x + camera(batch[f"{name}_{time}"])
+    return F.relu(self.norm(x))
+
+
+class ValueHead(nn.Module):
+  """Z: (phi, S actions) -> logits of the atoms."""
+
+  def __init__(self, config: AgentConfig):
+    super().__init__()
+    width = config.hidden[0]
+    self.phi = nn.Linear(config.feature_dim, width)
+    self.action = nn.Linear(JOINTS + 1, width, bias=False)
+    self.rest = mlp([*config.hidden, config.num_atoms])
+
+  def forward(self, phi: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+    """f32[B, n], f32[S, B, 7] -> f32[S, B, atoms]."""
+    command = torch.cat([actions[..., :-1], 2.0 * actions[..., -1:] - 1.0], -1)
+    return self.rest(F.relu(self.phi(phi) + self.action(command)))
+
+
+class Prior:
+  """A mixture of Gaussians, each with a gripper command."""
+
+  def __init__(self, raw: torch.Tensor, primitives: torch.Tensor, config: AgentConfig):
+    """Raw outputs f32[B, 3, 23], primitives f32[B, 3, 7]."""
+    log_std, below, weight, close = raw.split([JOINTS, BELOW, 1, 1], -1)
+    log_std = log_std + math.log(config.initial_std)
+    log_std = log_std.clamp(math.log(config.min_std), math.log(config.max_std))
+    rows, columns = torch.tril_indices(JOINTS, JOINTS, -1)
+    tril = torch.eye(JOINTS, device=raw.device).repeat(*raw.shape[:-1], 1, 1)
+    tril[..., rows, columns] = below.clamp(-1.0, 1.0)
+    tril = log_std.exp()[..., None] * F.normalize(tril, dim=-1)
+    surest = math.log((1.0 - config.min_prob) / config.min_prob)
+    self.logits = F.log_softmax(weight[..., 0].clamp(-surest, surest), -1)
+    self.arm = MultivariateNormal(
+      primitives[..., :-1].clamp(-1.0, 1.0), scale_tril=tril
+    )
+    odds = (primitives[..., -1] + close[..., 0]).clamp(-surest, surest)
+    self.gripper = Bernoulli(logits=odds)
+
+  def sample(self, count: int) -> torch.Tensor:
+    """f32[S, B, 7]."""
+    draws = torch.cat(
+      [self.arm.sample((count,)), self.gripper.sample((count,))[..., None]], -1
+    )
+    component = torch.distributions.Categorical(logits=self.logits).sample((count,))
+    index = component[..., None, None].expand(*component.shape, 1, JOINTS + 1)
+    return draws.gather(-2, index)[..., 0, :]
+
+  def log_prob(self, actions: torch.Tensor) -> torch.Tensor:
+    """f32[S, B, 7] -> f32[S, B]."""
+    arm = self.arm.log_prob(actions[..., None, :-1])
+    gripper = self.gripper.log_prob(actions[..., -1:])
+    return torch.logsumexp(self.logits + arm + gripper, -1)
+
+  def entropy(self) -> torch.Tensor:
+    """f32[B], of a component on average."""
+    each = self.arm.entropy() + self.gripper.entropy()
+    return (self.logits.exp() * each).sum(-1)
+
+
+class Networks(nn.Module):
+  """Encoder and heads."""
+
+  def __init__(self, config: AgentConfig):
+    super().__init__()
+    if (config.algorithm, config.global_features, config.wrist_features) != (
+      "ap_npql",
+      "map",
+      "map",
+    ):
+      raise ValueError("only ap_npql with maps of both cameras is written in PyTorch")
+    self.config = config
+    widths = [config.feature_dim, *config.hidden]
+    self.encoder = Encoder(config)
+    self.ap = mlp([*widths, PRIMITIVES * (JOINTS + 1)])
+    self.bp = mlp([*widths, PRIMITIVES * (JOINTS + BELOW + 2)])
+    self.z = ValueHead(config)
+    self.alpha = mlp([*widths, 1])
+
+  def temperature(self, phi: torch.Tensor) -> torch.Tensor:
+    """f32[B]."""
+    offset = math.log(math.expm1(self.config.initial_alpha))
+    raw = self.alpha(phi.detach())[..., 0]
+    return F.softplus(raw + offset) + self.config.min_alpha
+
+  def primitives(self, phi: torch.Tensor) -> torch.Tensor:
+    """f32[B, 3, 7]."""
+    return self.ap(phi).unflatten(-1, (PRIMITIVES, JOINTS + 1))
+
+  def prior(self, phi: torch.Tensor) -> Prior:
+    """b at the states; trains ``bp`` alone."""
+    raw = self.bp(phi.detach()).unflatten(-1, (PRIMITIVES, -1))
+    return Prior(raw, self.primitives(phi).detach(), self.config)
+
+  @torch.no_grad()
+  def improved(
+    self, phi: torch.Tensor, count: int, atoms: torch.Tensor
+  ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Candidates of q, their distributions of returns, values and weights."""
+    samples = self.prior(phi).sample(count)
+    probs = F.softmax(self.z(phi, samples.clamp(-1.0, 1.0)), -1)
+    values = probs @ atoms
+    weights = F.softmax(values / self.temperature(phi), 0)
+    return samples, probs, values, weights
+
+
+class Learner:
+  """Algorithm 1: one update per call of ``update``."""
+
+  def __init__(self, config: AgentConfig, device: str):
+    self.config = config
+    self.online = Networks(config).to(device)
+    self.target = copy.deepcopy(self.online).requires_grad_(False)
+    self.nu = torch.zeros((), device=device, requires_grad=True)
+    self.atoms = torch.linspace(
+      config.v_min, config.v_max, config.num_atoms, device=device
+    )
+    net = self.online
+    groups = (
+      ([*net.encoder.parameters(), *net.ap.parameters(), *net.z.parameters()], "e"),
+      ([*net.bp.parameters()], "m"),
+      ([*net.alpha.parameters()], "alpha"),
+      ([self.nu], "nu"),
+    )
+    self.optimisers = [
+      torch.optim.Adam(p, getattr(config, f"learning_rate_{name}"))
+      for p, name in groups
+    ]
+
+  def update(self, batch: Batch) -> float:
+    """Returns the sum of the losses."""
+    config, net = self.config, self.online
+    goal = self._target(batch)
+    phi = net.encoder(batch, "tm1")
+    logits = net.z(phi, batch["action"][None])[0]
+    samples, _, values, weights = net.improved(phi, config.policy_samples, self.atoms)
+    prior, alpha = net.prior(phi), net.temperature(phi)
+    log_mean = torch.logsumexp(values / alpha, 0) - math.log(config.policy_samples)
+    entropy = prior.entropy()
+    loss = (
+      config.lambda_ap * ap_loss(net.primitives(phi), batch["primitives"], config)
+      - (goal * F.log_softmax(logits, -1)).sum(-1).mean()
+      - (weights * prior.log_prob(samples)).sum(0).mean()
+      - (self.nu.detach() * entropy).mean()
+      + (alpha * (config.epsilon + log_mean)).mean()
+      + self.nu * (entropy.detach() - config.epsilon_nu).mean()
+    )
+    for optimiser in self.optimisers:
+      optimiser.zero_grad()
+    loss.backward()
+    for optimiser in self.optimisers:
+      parameters = optimiser.param_groups[0]["params"]
+      nn.utils.clip_grad_norm_(parameters, config.max_grad_norm)
+      optimiser.step()
+    with torch.no_grad():
+      self.nu.clamp_(min=0.0)
+      for old, new in zip(self.target.parameters(), net.parameters(), strict=True):
+        old.lerp_(new, config.target_rate)
+    return loss.item()
+
+  @torch.no_grad()
+  def _target(self, batch: Batch) -> torch.Tensor:
+    """f32[B, atoms]: the distributional target, projected."""
+    phi = self.target.encoder(batch, "t")
+    _, probs, _, weights = self.target.improved(
+      phi, self.config.target_samples, self.atoms
+    )
+    probs = (weights[..., None] * probs).sum(0)
+    low, high = self.config.v_min, self.config.v_max
+    moved = batch["reward"][:, None] + batch["discount"][:, None] * self.atoms
+    place = (moved.clamp(low, high) - low) / (high - low) * (len(self.atoms) - 1)
+    lower = place.floor().clamp(max=len(self.atoms) - 2)
+    share = place - lower
+    index = lower.long()
+    goal = torch.zeros_like(probs).scatter_add_(-1, index, probs * (1.0 - share))
+    return goal.scatter_add_(-1, index + 1, probs * share)
+
+
+def ap_loss(
+  predicted: torch.Tensor, label: torch.Tensor, config: AgentConfig
+) -> torch.Tensor:
+  """Behaviour cloning of the primitives."""
+  delta = config.ap_delta
+  huber = F.huber_loss(predicted[..., :-1], label[..., :-1], delta=delta) / delta
+  command = F.binary_cross_entropy_with_logits(predicted[..., -1], label[..., -1])
+  return huber + command
+
+
+def mlp(widths: list[int]) -> nn.Sequential:
+  """Linear layers with relu between."""
+  layers: list[nn.Module] = []
+  for before, after in zip(widths, widths[1:], strict=False):
+    layers += [nn.Linear(before, after), nn.ReLU()]
+  return nn.Sequential(*layers[:-1])
+
+
+def random_batch(count: int, device: str) -> Batch:
+  """Noise in the shapes of a batch."""
+  rng = np.random.default_rng(0)
+  batch: dict[str, np.ndarray] = {
+    "action": rng.uniform(-1, 1, (count, 7)),
+    "reward": rng.integers(0, 2, count),
+    "discount": np.full(count, 0.97),
+    "primitives": rng.uniform(0, 1, (count, PRIMITIVES, 7)),
+  }
+  for time in ("tm1", "t"):
+    batch[f"robot_{time}"] = rng.normal(size=(count, 21))
+    for name, size in IMAGES.items():
+      batch[f"{name}_{time}"] = rng.integers(0, 256, (count, 3, *size), np.uint8)
+  return {
+    name: torch.as_tensor(x if x.dtype == np.uint8 else x.astype(np.float32)).to(device)
+    for name, x in batch.items()
+  }
+
+
+def main(settings: dict[str, Any]) -> None:
+  """Serves updates."""
+  device = "cuda" if torch.cuda.is_available() else "cpu"
+  config = dataclasses.replace(
+    load_preset(settings["preset"]).agent,
+    target_samples=settings["candidates"],
+    policy_samples=settings["candidates"],
+  )
+  learner, batch = Learner(config, device), random_batch(settings["batch"], device)
+  measure = sides.rate_of(lambda: learner.update(batch), 1)
+  sides.serve({"updates": measure}, version=torch.__version__, device=device)
+
+
+if __name__ == "__main__":
+  main(json.loads(sys.argv[1]))
