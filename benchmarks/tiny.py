@@ -61,6 +61,10 @@ _PRESET_ARGS = (
 ).split()
 
 
+FLAGS = " ".join(f"--{name}={value}" for name, value in FAST_COMPILE.items())
+"""The same as ``XLA_FLAGS``."""
+
+
 def start(
   run_dir: Path, *args: str, said: Path, log_compiles: bool = False
 ) -> subprocess.Popen[bytes]:
@@ -70,8 +74,7 @@ def start(
     command += ["--resume", str(run_dir)]
   else:
     command += ["push_plate", "--run", str(run_dir), *_PRESET_ARGS]
-  flags = " ".join(f"--{name}={value}" for name, value in FAST_COMPILE.items())
-  env = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": str(ROOT)}
+  env = os.environ | {"XLA_FLAGS": FLAGS, "PYTHONPATH": str(ROOT)}
   env |= {"JAX_LOG_COMPILES": "1"} if log_compiles else {}
   with said.open("ab") as file:
     return subprocess.Popen(
@@ -106,11 +109,16 @@ def rows(run_dir: Path) -> list[dict[str, Any]]:
 
 
 def saved_bytes(run_dir: Path, step: int) -> dict[str, bytes]:
+  """The bits of every array of a checkpoint."""
+  return {name: x.tobytes() for name, x in saved_arrays(run_dir, step).items()}
+
+
+def saved_arrays(run_dir: Path, step: int) -> dict[str, np.ndarray]:
   """Every array of a checkpoint, read by Orbax alone."""
   found = {}
   for item in ("learner", "rest", "replay"):
     with ocp.StandardCheckpointer() as reader:
       tree = reader.restore((run_dir / "checkpoints" / str(step) / item).absolute())
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-      found[f"{item} {path}"] = np.asarray(leaf).tobytes()
+      found[f"{item} {jax.tree_util.keystr(path)}"] = np.asarray(leaf)
   return found
