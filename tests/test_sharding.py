@@ -20,6 +20,7 @@ import time
 from typing import Any
 
 import jax
+import messages
 import numpy as np
 import pytest
 import tiny
@@ -94,13 +95,13 @@ def tell(backend: str) -> None:
   told["distance"] = float(np.linalg.norm(ends[1] - ends[0]))
   told["way"] = float(np.linalg.norm(ends[0] - begin))
   told["split"] = _split(state)
-  told["messages"] = _messages(iteration)
+  told["messages"] = messages.messages(iteration)
 
   def play(state: TrainState) -> Any:
     policy = agent_policy(agent, state.learner.params, greedy=False)
     return rollout(env, policy, state.env, state.key, length=2)
 
-  told["messages_of_rollout"] = _messages(jax.jit(play).lower(state).compile())
+  told["messages_of_rollout"] = messages.messages(jax.jit(play).lower(state).compile())
   with tempfile.TemporaryDirectory() as name:
     run = Path(name)
     with CheckpointWriter(run, config, keep=1) as writer:
@@ -128,13 +129,6 @@ def _split(state: TrainState) -> list[str]:
     part = "/".join(name.split("/")[: 2 if "replay" in name else 1])
     parts.setdefault(part, set()).add(sizes[0] * DEVICES == leaf.size != 0)
   return sorted(part for part, split in parts.items() if split == {True})
-
-
-def _messages(program: Any) -> list[str]:
-  """What devices send to each other, as XLA writes its type."""
-  kinds = "all-reduce|all-gather|all-to-all|collective-permute|reduce-scatter"
-  found = re.findall(rf"= (.*) (?:{kinds})(?:-start)?\(", program.as_text())
-  return sorted(set(found))
 
 
 def test_two_processes_learn_what_one_learns_and_stop_together(tmp_path):
