@@ -173,6 +173,8 @@ def _mesh(args: Train) -> Mesh | None:
   """
   if args.coordinator and args.run is None and args.resume is None:
     raise ConfigError("processes of one run must be given the same --run")
+  if not args.coordinator and (args.processes, args.process) != (None, None):
+    raise ConfigError("--processes and --process need a --coordinator")
   from apnpql_jax import sharding
 
   devices = args.devices

@@ -12,6 +12,8 @@ from jax.experimental import multihost_utils
 import jax.numpy as jnp
 import numpy as np
 
+from apnpql_jax import sharding
+
 _SLAB_BYTES = 64 << 20
 """What is gathered at once has to fit onto one device."""
 
@@ -61,6 +63,7 @@ def checksums(tree: Any) -> dict[str, int]:
 
   All processes that hold parts of the leaves must ask for them together.
   """
+  sharding.meet()
   return {path: _crc32(_key_data(leaf)) for path, leaf in named(tree).items()}
 
 
@@ -112,8 +115,8 @@ def abstract(tree: Any) -> Any:
     if not leaf.size:
       return None
     plain = jax.eval_shape(_key_data, leaf)
-    sharding = getattr(leaf, "sharding", None) or default
-    return jax.ShapeDtypeStruct(plain.shape, plain.dtype, sharding=sharding)
+    where = getattr(leaf, "sharding", None) or default
+    return jax.ShapeDtypeStruct(plain.shape, plain.dtype, sharding=where)
 
   return jax.tree.map(struct, tree)
 

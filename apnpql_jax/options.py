@@ -50,7 +50,8 @@ class Train:
   """Short for --agent.algorithm; `apnpql list` names them."""
 
   devices: int = 1
-  """Devices between which worlds and batches are split; 0: all."""
+  """Devices between which worlds and batches are split; 0: all, as several processes
+  always do."""
 
   coordinator: str = ""
   """Address and port of the first process, where several share the run: see

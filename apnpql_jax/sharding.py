@@ -9,6 +9,7 @@ share one run: each computes for its own devices, and the first one tells of it.
 from __future__ import annotations
 
 from collections.abc import Callable
+import itertools
 from typing import Any
 
 import jax
@@ -20,6 +21,9 @@ from apnpql_jax.config import ConfigError
 
 AXIS = "worlds"
 """The one axis of the mesh; batches are split along it too."""
+
+_PATIENCE_MS = 3_600_000
+_meetings = itertools.count()
 
 
 def join(coordinator: str, processes: int | None, process: int | None) -> None:
@@ -93,16 +97,28 @@ def leads() -> bool:
   return jax.process_index() == 0
 
 
-def first_alone(function: Callable[[], None]) -> None:
+def first_alone(function: Callable[[], Any]) -> None:
   """Calls it in the first process; the others go on when it is done."""
   if leads():
     function()
-  if jax.process_count() > 1:
-    multihost_utils.sync_global_devices("first_alone")
+  meet()
 
 
 def anywhere(flag: object) -> bool:
   """Whether it is true in any process, the same answer in all of them."""
-  if jax.process_count() == 1:
-    return bool(flag)
+  meet()
   return bool(multihost_utils.process_allgather(np.array(bool(flag))).any())
+
+
+def meet() -> None:
+  """Returns when all processes have come here, however long that takes.
+
+  Within a program, CPUs wait for each other no longer than 30 seconds: what takes one
+  process longer than another must be followed by this.
+  """
+  if jax.process_count() == 1:
+    return
+  from orbax.checkpoint import multihost
+
+  wait = multihost.get_barrier_sync_fn()
+  wait(key=f"apnpql_{next(_meetings)}", timeout_ms=_PATIENCE_MS)

@@ -120,7 +120,10 @@ def _run(
     _reporting(config, start) as reporter,
     CheckpointWriter(start.folder.path, config, keep=config.keep_checkpoints) as saver,
   ):
-    iteration = make_iteration(config, start.env, start.agent)
+    iteration: Any = make_iteration(config, start.env, start.agent)
+    if start.env.mesh is not None:
+      iteration = iteration.lower(start.state).compile()
+      sharding.meet()
     state = _loop(config, iteration, start.state, reporter, saver, signals)
     if figures := saver.finished(wait=True):
       reporter.write(int(state.env_steps), figures)

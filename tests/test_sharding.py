@@ -189,6 +189,7 @@ def test_what_cannot_be_split_is_refused(devices, message):
   [
     (["--devices", "99"], "--devices 99 must be within 0 (all) and 1"),
     (["--coordinator", "a:1"], "processes of one run must be given the same --run"),
+    (["--processes", "2"], "--processes and --process need a --coordinator"),
   ],
 )
 def test_bad_options_are_refused_in_one_line(options, message, capsys):
