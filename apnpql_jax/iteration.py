@@ -56,10 +56,7 @@ def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
 
   The state is donated: the caller must go on with the one returned.
   """
-  draw = make_sample(config, agent)
-
-  def sample(*args: Any) -> Transition:
-    return place(draw(*args), env.mesh)
+  sample = make_sample(config, agent, env.mesh)
 
   def iteration(state: TrainState) -> tuple[TrainState, Metrics]:
     key, rollout_key, update_key = jax.random.split(state.key, 3)
@@ -111,9 +108,11 @@ def _update(agent, sample, ring, expert_replay, carry, key) -> Any:
   return (learner, faults), (metrics, ok)
 
 
-def make_sample(config: TrainConfig, agent: Agent) -> Callable[..., Transition]:
+def make_sample(
+  config: TrainConfig, agent: Agent, mesh: Mesh | None = None
+) -> Callable[..., Transition]:
   """(replay, expert replay, key) -> the batch of one update, [B, ...]."""
-  return functools.partial(
+  draw = functools.partial(
     replay.sample_mixed,
     batch_size=config.replay.batch_size,
     expert_share=config.replay.expert_share,
@@ -121,6 +120,15 @@ def make_sample(config: TrainConfig, agent: Agent) -> Callable[..., Transition]:
     gamma=config.agent.gamma,
     windows=agent.networks.evaluation.windows,
   )
+  if mesh is None:
+    return draw
+
+  def sample(*args: Any) -> Transition:
+    # Whole at first: XLA would split the draws too, and collect them piece by piece.
+    whole = NamedSharding(mesh, PartitionSpec())
+    return place(jax.lax.with_sharding_constraint(draw(*args), whole), mesh)
+
+  return sample
 
 
 def place(tree: Any, mesh: Mesh | None) -> Any:

@@ -48,13 +48,13 @@ def measure(args: argparse.Namespace) -> dict[str, int]:
   config, mesh = load_preset(args.preset), sharding.make_mesh(args.devices)
   env, agent = make_env(config.env, mesh), make_agent(config.agent)
   state = example_state(config, env, agent)
-  draw = make_sample(config, agent)
+  sample = make_sample(config, agent, mesh)
 
   def update(state: TrainState) -> Any:
-    batch = place(draw(state.replay, state.expert_replay, state.key), mesh)
+    batch = sample(state.replay, state.expert_replay, state.key)
     return place(agent.update(state.learner, batch, state.key), mesh)
 
-  batch = jax.eval_shape(draw, state.replay, state.expert_replay, state.key)
+  batch = jax.eval_shape(sample, state.replay, state.expert_replay, state.key)
   sent = messages(jax.jit(update).lower(state).compile())
   return {
     "parameters_bytes": leaves.nbytes(state.learner.params),

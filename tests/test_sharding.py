@@ -20,6 +20,7 @@ import time
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import messages
 import numpy as np
 import pytest
@@ -36,6 +37,7 @@ from apnpql_jax.iteration import (
   example_state,
   initial_state,
   make_iteration,
+  shardings,
 )
 from apnpql_jax.rollout import agent_policy, rollout
 
@@ -82,31 +84,32 @@ def tell(backend: str) -> None:
   replay = dataclasses.replace(tiny.CONFIG.replay, capacity=LENGTH * env.worlds)
   config = dataclasses.replace(tiny.CONFIG, env=env, replay=replay)
   told: dict[str, Any] = {"loss": []}
-  ends = []
-  for mesh in (None, sharding.make_mesh(DEVICES)):
-    env, agent = make_env(config.env, mesh), make_agent(config.agent)
-    state = initial_state(config, env, agent, collect_expert)
-    begin = _flat(state)
+  several = make_env(config.env, sharding.make_mesh(DEVICES))
+  alone, agent, ends = several.on_one_device(), make_agent(config.agent), []
+  begin = initial_state(config, alone, agent, collect_expert)
+  for env in (alone, several):
+    copy = jax.tree.map(jnp.copy, begin)  # The iteration takes the state for itself.
+    state = jax.device_put(copy, shardings(copy, env.mesh))
     iteration = make_iteration(config, env, agent).lower(state).compile()
     for _ in range(ITERATIONS):
       state, metrics = iteration(state)
     told["loss"].append(float(metrics["loss/q"]))
     ends.append(_flat(state))
   told["distance"] = float(np.linalg.norm(ends[1] - ends[0]))
-  told["way"] = float(np.linalg.norm(ends[0] - begin))
+  told["way"] = float(np.linalg.norm(ends[0] - _flat(begin)))
   told["split"] = _split(state)
   told["messages"] = messages.messages(iteration)
 
   def play(state: TrainState) -> Any:
     policy = agent_policy(agent, state.learner.params, greedy=False)
-    return rollout(env, policy, state.env, state.key, length=2)
+    return rollout(several, policy, state.env, state.key, length=2)
 
   told["messages_of_rollout"] = messages.messages(jax.jit(play).lower(state).compile())
   with tempfile.TemporaryDirectory() as name:
     run = Path(name)
     with CheckpointWriter(run, config, keep=1) as writer:
       writer.save(1, resuming.to_items(state, whole=True))
-    for key, place in (("four", env), ("one", env.on_one_device())):
+    for key, place in (("four", several), ("one", alone)):
       example = example_state(config, place, agent)
       found = resuming.restore(config, run, example, print)
       same = leaves.checksums(found) == leaves.checksums(state)
