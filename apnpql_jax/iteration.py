@@ -9,7 +9,13 @@ from typing import Any
 from flax import struct
 import jax
 import jax.numpy as jnp
-from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
+from jax.sharding import (
+  Mesh,
+  NamedSharding,
+  PartitionSpec,
+  Sharding,
+  SingleDeviceSharding,
+)
 
 from apnpql_jax import replay
 from apnpql_jax.agents.learner import Agent, LearnerState
@@ -142,13 +148,12 @@ def shardings(tree: Any, mesh: Mesh | None) -> Any:
   """Where ``place`` puts each leaf; on the default device if there is no mesh."""
 
   def of(part: Any) -> Any:
-    if mesh is None:
-      return SingleDeviceSharding(jax.devices()[0])
-    where = NamedSharding(mesh, _SPLIT.get(type(part), PartitionSpec()))
+    where: Sharding = SingleDeviceSharding(jax.local_devices()[0])
+    if mesh is not None:
+      where = NamedSharding(mesh, _SPLIT.get(type(part), PartitionSpec()))
     return jax.tree.map(lambda _: where, part)
 
-  whole = None if mesh is None else lambda part: type(part) in _SPLIT
-  return jax.tree.map(of, tree, is_leaf=whole)
+  return jax.tree.map(of, tree, is_leaf=lambda part: type(part) in _SPLIT)
 
 
 def all_finite(tree: Any) -> Array:
