@@ -109,16 +109,11 @@ def rows(run_dir: Path) -> list[dict[str, Any]]:
 
 
 def saved_bytes(run_dir: Path, step: int) -> dict[str, bytes]:
-  """The bits of every array of a checkpoint."""
-  return {name: x.tobytes() for name, x in saved_arrays(run_dir, step).items()}
-
-
-def saved_arrays(run_dir: Path, step: int) -> dict[str, np.ndarray]:
   """Every array of a checkpoint, read by Orbax alone."""
   found = {}
   for item in ("learner", "rest", "replay"):
     with ocp.StandardCheckpointer() as reader:
       tree = reader.restore((run_dir / "checkpoints" / str(step) / item).absolute())
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-      found[f"{item} {jax.tree_util.keystr(path)}"] = np.asarray(leaf)
+      found[f"{item} {path}"] = np.asarray(leaf).tobytes()
   return found
