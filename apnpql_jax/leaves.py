@@ -70,7 +70,8 @@ def checksums(tree: Any) -> dict[str, int]:
 def _crc32(array: Any) -> int:
   crc32 = 0
   for part in _on_host(array):
-    crc32 = zlib.crc32(np.ascontiguousarray(part).reshape(-1).view(np.uint8), crc32)
+    flat = np.ascontiguousarray(part).reshape(-1)
+    crc32 = zlib.crc32(flat.view(np.uint8).data, crc32)
   return crc32
 
 

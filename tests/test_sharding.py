@@ -90,7 +90,8 @@ def tell(backend: str) -> None:
   for env in (alone, several):
     copy = jax.tree.map(jnp.copy, begin)  # The iteration takes the state for itself.
     state = jax.device_put(copy, shardings(copy, env.mesh))
-    iteration = make_iteration(config, env, agent).lower(state).compile()
+    jitted: Any = make_iteration(config, env, agent)
+    iteration = jitted.lower(state).compile()
     for _ in range(ITERATIONS):
       state, metrics = iteration(state)
     told["loss"].append(float(metrics["loss/q"]))
