@@ -46,8 +46,8 @@ ITERATIONS = 3
 LENGTH = 26
 """Time steps of the replay: of the sizes in the program, only it has this one."""
 
-ROUNDING = 1e-3
-"""Of the way that the parameters have come."""
+ROUNDING = 1e-4
+"""Of the way that the parameters have come; measured: 1e-6."""
 
 PATIENCE_S = 600
 
