@@ -40,7 +40,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parsed = parse(kind, args[0], args[1:], default=_preset_named(kind, args))
     with Signals("interrupted"), _only_json(parsed.json) as write:
       result = command(parsed, args[1:])
-      write(_to_json(result) if parsed.json else show(result))
+      if result:  # Of several processes, the first one tells.
+        write(_to_json(result) if parsed.json else show(result))
     return 0
   except ConfigError as error:
     print("apnpql: " + " ".join(str(error).split()), file=sys.stderr)

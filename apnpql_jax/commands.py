@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from apnpql_jax import presets, runs
 from apnpql_jax.config import (
@@ -21,6 +21,9 @@ from apnpql_jax.config import (
   validate,
 )
 from apnpql_jax.options import Collect, Convert, Evaluate, List, Repeat, Train, parse
+
+if TYPE_CHECKING:
+  from jax.sharding import Mesh
 
 Json = dict[str, Any]
 
@@ -45,13 +48,20 @@ def train(args: Train, argv: Sequence[str]) -> Json:
   validate(config)
   if args.resume is not None:
     runs.check_resumable(args.resume, config)
-  _check_registered(config)
+  mesh = _mesh(args)
+  _check_registered(config, devices=mesh.size if mesh else 1)
 
+  from apnpql_jax import sharding
   from apnpql_jax.train import train as run_training
 
-  return run_training(
-    config, run_dir, resume=args.resume is not None, overwrite=args.overwrite
+  summary = run_training(
+    config,
+    run_dir,
+    resume=args.resume is not None,
+    overwrite=args.overwrite,
+    mesh=mesh,
   )
+  return summary if sharding.leads() else {}
 
 
 def evaluate(args: Evaluate, argv: Sequence[str]) -> Json:
@@ -155,7 +165,26 @@ def list_names(args: List, argv: Sequence[str]) -> Json:
   }
 
 
-def _check_registered(config: TrainConfig) -> None:
+def _mesh(args: Train) -> Mesh | None:
+  """The devices to train on; waits for the other processes, if there are any.
+
+  Nothing is written until all have come here, so that all have seen the same run
+  folder before.
+  """
+  if args.coordinator and args.run is None and args.resume is None:
+    raise ConfigError("processes of one run must be given the same --run")
+  if not args.coordinator and (args.processes, args.process) != (None, None):
+    raise ConfigError("--processes and --process need a --coordinator")
+  from apnpql_jax import sharding
+
+  devices = args.devices
+  if args.coordinator:
+    sharding.join(args.coordinator, args.processes, args.process)
+    devices = 0
+  return sharding.make_mesh(devices)
+
+
+def _check_registered(config: TrainConfig, *, devices: int) -> None:
   """Checks what needs the simulator, the learner or the device to be known."""
   from apnpql_jax import memory, tasks
   from apnpql_jax.agents import algorithms
@@ -165,6 +194,7 @@ def _check_registered(config: TrainConfig) -> None:
     tasks=tasks.task_names(),
     algorithms=algorithms.epsilon_is_bounded(),
     memory_bytes=memory.available_memory(),
+    devices=devices,
   )
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from apnpql_jax import memory, npz, replay
 from apnpql_jax.config import ConfigError, EnvConfig, TrainConfig
 from apnpql_jax.env import Env, EnvState, make_env
-from apnpql_jax.iteration import example_slot
+from apnpql_jax.iteration import example_slot, place
 from apnpql_jax.primitives import ik
 from apnpql_jax.replay import Replay
 from apnpql_jax.rollout import expert_policy
@@ -182,7 +182,8 @@ def make_replay(demos: Demonstrations, config: TrainConfig, env: Env) -> Replay:
 
     start = env.reset(jnp.zeros(worlds, jnp.int32))
     _, chunk = jax.lax.scan(instant, start, (index, fresh, targets, ends))
-    return replay.add(replay.create(example_slot(start), length, worlds), chunk)
+    ring = replay.add(replay.create(example_slot(start), length, worlds), chunk)
+    return place(ring, env.mesh)
 
   return remake(*map(jnp.asarray, (index, fresh, targets, ends)))
 

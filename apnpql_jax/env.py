@@ -13,7 +13,9 @@ import functools
 from flax import struct
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 
+from apnpql_jax import sharding
 from apnpql_jax.cameras import Renderer, make_cameras
 from apnpql_jax.config import ConfigError, EnvConfig
 from apnpql_jax.primitives import tracking
@@ -46,27 +48,37 @@ class EnvState(struct.PyTreeNode):
 class Env:
   """The worlds of one task; holds constants only."""
 
-  def __init__(self, config: EnvConfig, task: Task, bank: ResetBank):
+  def __init__(
+    self, config: EnvConfig, task: Task, bank: ResetBank, mesh: Mesh | None = None
+  ):
     """
     Args:
       config: sizes, limits, backend and what is observed.
       task: the task.
       bank: its reset states.
+      mesh: the devices between which the worlds are split; one device if None.
     """
     scene = task.scene
     substeps = _substeps(config, scene)
     self.config = config
     self.task = task
+    self.mesh = mesh
     self.physics = physics.make_physics(config.backend, scene, substeps=substeps)
     self._bank = bank
     self._chain = arm.make_chain(scene)
     self._kinematics = make_kinematics(scene)
     self._cameras = make_cameras(config, scene)
     # Resets, steps and visits share one trace for each number of worlds.
-    self._arrive = jax.jit(self._judge_and_observe)
+    self._arrive = sharding.per_device(jax.jit(self._judge_and_observe), mesh)
     self._randomize = None
     if config.randomize:
       self._randomize = make_randomize(config.randomization, scene)
+
+  def on_one_device(self) -> Env:
+    """The same worlds without a mesh, for evaluations and videos."""
+    if self.mesh is None:
+      return self
+    return Env(self.config, self.task, self._bank)
 
   @property
   def bank_split(self) -> int:
@@ -103,7 +115,8 @@ class Env:
       action: f32[worlds, 7], see ``types.ACTION_DIM``.
       key: draws the rows of worlds that start again.
     """
-    moved = self.physics.step(state.physics, action[:, :6], action[:, 6])
+    advance = sharding.per_device(self.physics.step, self.mesh)
+    moved = advance(state.physics, action[:, :6], action[:, 6])
     broken = ~state.timestep.last & ~self._sound(state, action, moved)
     reset = state.timestep.last | broken
     rows = jax.random.randint(key, reset.shape, 0, self.bank_split)
@@ -226,8 +239,12 @@ class Env:
     return seen.replace(global_image=overview, wrist_image=wrist)
 
 
-def make_env(config: EnvConfig) -> Env:
+def make_env(config: EnvConfig, mesh: Mesh | None = None) -> Env:
   """The worlds of ``config.task``; builds the reset bank on first use.
+
+  Args:
+    config: see ``Env``.
+    mesh: see ``Env``.
 
   Raises:
     ConfigError: unknown task or backend, a scene that cannot be simulated or drawn, a
@@ -237,7 +254,7 @@ def make_env(config: EnvConfig) -> Env:
   # What cannot be drawn is refused before the bank is built.
   make_cameras(config, task.scene)
   bank, _ = load_bank(task, config.bank_rows)
-  return Env(config, task, bank)
+  return Env(config, task, bank, mesh)
 
 
 def _substeps(config: EnvConfig, scene: Scene) -> int:

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import jax
+from jax.experimental import multihost_utils
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax import leaves, npz, runs
+from apnpql_jax import leaves, npz, runs, sharding
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config import ConfigError, TrainConfig
 from apnpql_jax.iteration import TrainState, make_sample
@@ -50,8 +51,11 @@ def write(path: Path, config: TrainConfig, state: TrainState) -> None:
   sample = make_sample(config, make_agent(config.agent))
   batch = sample(state.replay, state.expert_replay, sample_key)
   update = {"learner": state.learner, "batch": batch, "key": learn_key}
-  arrays: dict[str, Any] = jax.device_get(leaves.named(leaves.to_plain(update)))
-  np.savez(path, **arrays)
+  arrays: dict[str, Any] = multihost_utils.process_allgather(
+    leaves.named(leaves.to_plain(update)), tiled=True
+  )
+  if sharding.leads():
+    np.savez(path, **arrays)
 
 
 def repeat(path: Path) -> dict[str, list[str]]:

@@ -9,6 +9,13 @@ from typing import Any
 from flax import struct
 import jax
 import jax.numpy as jnp
+from jax.sharding import (
+  Mesh,
+  NamedSharding,
+  PartitionSpec,
+  Sharding,
+  SingleDeviceSharding,
+)
 
 from apnpql_jax import replay
 from apnpql_jax.agents.learner import Agent, LearnerState
@@ -16,6 +23,7 @@ from apnpql_jax.config import TrainConfig
 from apnpql_jax.env import Env, EnvState
 from apnpql_jax.replay import Replay
 from apnpql_jax.rollout import agent_policy, expert_policy, rollout
+from apnpql_jax.sharding import AXIS
 from apnpql_jax.types import ACTION_DIM, Array, Metrics, Slot, Transition
 
 
@@ -38,6 +46,13 @@ class TrainState(struct.PyTreeNode):
   faults: Faults
 
 
+_SPLIT = {
+  EnvState: PartitionSpec(AXIS),
+  Slot: PartitionSpec(None, AXIS),  # As the replay holds them, [time, worlds, ...].
+  Transition: PartitionSpec(AXIS),
+}
+"""What is split between devices, and along which axis; of all else each has a copy."""
+
 Iteration = Callable[[TrainState], tuple[TrainState, Metrics]]
 ExpertReplay = Callable[[TrainConfig, Env, Array], Replay | None]
 
@@ -47,7 +62,7 @@ def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
 
   The state is donated: the caller must go on with the one returned.
   """
-  sample = make_sample(config, agent)
+  sample = make_sample(config, agent, env.mesh)
 
   def iteration(state: TrainState) -> tuple[TrainState, Metrics]:
     key, rollout_key, update_key = jax.random.split(state.key, 3)
@@ -68,14 +83,15 @@ def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
       "faults/updates_in_a_row": faults.in_a_row,
     }
     steps = config.rollout_length * config.env.worlds
-    return state.replace(
+    state = state.replace(
       learner=learner,
       env=worlds,
       replay=ring,
       key=key,
       env_steps=state.env_steps + steps,
       faults=faults,
-    ), metrics
+    )
+    return place((state, metrics), env.mesh)
 
   return jax.jit(iteration, donate_argnums=0)
 
@@ -98,9 +114,11 @@ def _update(agent, sample, ring, expert_replay, carry, key) -> Any:
   return (learner, faults), (metrics, ok)
 
 
-def make_sample(config: TrainConfig, agent: Agent) -> Callable[..., Transition]:
+def make_sample(
+  config: TrainConfig, agent: Agent, mesh: Mesh | None = None
+) -> Callable[..., Transition]:
   """(replay, expert replay, key) -> the batch of one update, [B, ...]."""
-  return functools.partial(
+  draw = functools.partial(
     replay.sample_mixed,
     batch_size=config.replay.batch_size,
     expert_share=config.replay.expert_share,
@@ -108,6 +126,34 @@ def make_sample(config: TrainConfig, agent: Agent) -> Callable[..., Transition]:
     gamma=config.agent.gamma,
     windows=agent.networks.evaluation.windows,
   )
+  if mesh is None:
+    return draw
+
+  def sample(*args: Any) -> Transition:
+    # Whole at first: XLA would split the draws too, and collect them piece by piece.
+    whole = NamedSharding(mesh, PartitionSpec())
+    return place(jax.lax.with_sharding_constraint(draw(*args), whole), mesh)
+
+  return sample
+
+
+def place(tree: Any, mesh: Mesh | None) -> Any:
+  """Inside jit: the same tree, each part of which lies where ``_SPLIT`` says."""
+  if mesh is None:
+    return tree
+  return jax.lax.with_sharding_constraint(tree, shardings(tree, mesh))
+
+
+def shardings(tree: Any, mesh: Mesh | None) -> Any:
+  """Where ``place`` puts each leaf; on the default device if there is no mesh."""
+
+  def of(part: Any) -> Any:
+    where: Sharding = SingleDeviceSharding(jax.local_devices()[0])
+    if mesh is not None:
+      where = NamedSharding(mesh, _SPLIT.get(type(part), PartitionSpec()))
+    return jax.tree.map(lambda _: where, part)
+
+  return jax.tree.map(of, tree, is_leaf=lambda part: type(part) in _SPLIT)
 
 
 def all_finite(tree: Any) -> Array:
@@ -141,7 +187,7 @@ def initial_state(
     rows = jax.random.randint(keys[0], (config.env.worlds,), 0, env.bank_split)
     worlds = env.reset(rows)
     length = config.replay.capacity // config.env.worlds
-    return TrainState(
+    state = TrainState(
       learner=agent.init(keys[1], worlds.timestep.observation),
       env=worlds,
       replay=replay.create(example_slot(worlds), length, config.env.worlds),
@@ -149,12 +195,23 @@ def initial_state(
       key=key,
       env_steps=jnp.zeros((), jnp.int32),
       faults=Faults(in_a_row=jnp.zeros((), jnp.int32), key=keys[3]),
-    ), keys[2]
+    )
+    return place((state, keys[2]), env.mesh)
 
   state, expert_key = start(jax.random.key(config.seed))
   state = state.replace(expert_replay=expert(config, env, expert_key))
-  # Bound to the device, as a restored state is, so that both make the same program.
-  return jax.device_put(state, jax.devices()[0])
+  # Bound to its devices, as a restored state is, so that both make the same program.
+  return jax.device_put(state, shardings(state, env.mesh))
+
+
+def example_state(config: TrainConfig, env: Env, agent: Agent) -> TrainState:
+  """Shapes, dtypes and devices of the state, without taking memory for it."""
+  state = jax.eval_shape(lambda: initial_state(config, env, agent, empty_expert))
+  return jax.tree.map(
+    lambda x, where: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=where),
+    state,
+    shardings(state, env.mesh),
+  )
 
 
 def example_slot(worlds: EnvState) -> Slot:
@@ -193,6 +250,6 @@ def collect_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:
     state = env.reset(rows)
     after, chunk = rollout(env, policy, state, play_key, length=length)
     ring = replay.create(example_slot(state), length, worlds)
-    return _remember(ring, state, after, chunk)
+    return place(_remember(ring, state, after, chunk), env.mesh)
 
   return collect(key)

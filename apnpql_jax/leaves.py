@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 import math
 from typing import Any
 import zlib
 
 import jax
+from jax.experimental import multihost_utils
 import jax.numpy as jnp
 import numpy as np
+
+from apnpql_jax import sharding
+
+_SLAB_BYTES = 64 << 20
+"""What is gathered at once has to fit onto one device."""
 
 
 def named(tree: Any) -> dict[str, Any]:
@@ -28,8 +34,14 @@ def fill(example: Any, arrays: Mapping[str, Any]) -> Any:
 
 
 def nbytes(tree: Any) -> int:
-  """Bytes that the leaves take; ShapeDtypeStructs do."""
-  return sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(tree))
+  """Bytes that the leaves take on each of their devices; ShapeDtypeStructs do."""
+
+  def size(leaf: Any) -> int:
+    where = getattr(leaf, "sharding", None)
+    shape = leaf.shape if where is None else where.shard_shape(leaf.shape)
+    return math.prod(shape) * leaf.dtype.itemsize
+
+  return sum(map(size, jax.tree.leaves(tree)))
 
 
 def describe(tree: Any) -> dict[str, str]:
@@ -47,14 +59,30 @@ def key_impls(tree: Any) -> dict[str, str]:
 
 
 def checksums(tree: Any) -> dict[str, int]:
-  """Path of each leaf -> CRC-32 of its bytes, typed keys by their data."""
-  return {
-    path: zlib.crc32(_bytes(_key_data(leaf)).data) for path, leaf in named(tree).items()
-  }
+  """Path of each leaf -> CRC-32 of its bytes, typed keys by their data.
+
+  All processes that hold parts of the leaves must ask for them together.
+  """
+  sharding.meet()
+  return {path: _crc32(_key_data(leaf)) for path, leaf in named(tree).items()}
 
 
-def _bytes(array: Any) -> np.ndarray:
-  return np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+def _crc32(array: Any) -> int:
+  crc32 = 0
+  for part in _on_host(array):
+    flat = np.ascontiguousarray(part).reshape(-1)
+    crc32 = zlib.crc32(flat.view(np.uint8).data, crc32)
+  return crc32
+
+
+def _on_host(array: Any) -> Iterator[Any]:
+  """The array, or if this process lacks parts of it, slabs gathered from all."""
+  if getattr(array, "is_fully_addressable", True) or array.is_fully_replicated:
+    yield array
+  elif array.size:
+    rows = max(1, _SLAB_BYTES * len(array) // array.nbytes)
+    for start in range(0, len(array), rows):
+      yield multihost_utils.process_allgather(array[start : start + rows], tiled=True)
 
 
 def to_plain(tree: Any) -> Any:
@@ -70,7 +98,7 @@ def to_typed(tree: Any, impls: Mapping[str, str], example: Any) -> Any:
 
   def restored(path: Any, like: Any, leaf: jax.Array | None) -> jax.Array:
     if leaf is None:
-      return jnp.zeros(like.shape, like.dtype)
+      return jnp.zeros(like.shape, like.dtype, device=getattr(like, "sharding", None))
     impl = impls.get(_name(path))
     return leaf if impl is None else jax.random.wrap_key_data(leaf, impl=impl)
 
@@ -80,7 +108,7 @@ def to_typed(tree: Any, impls: Mapping[str, str], example: Any) -> Any:
 def abstract(tree: Any) -> Any:
   """ShapeDtypeStructs of ``to_plain(tree)``, each on its leaf's devices.
 
-  Leaves that name no device, and keys, are put on the default one.
+  Leaves that name no device are put on the default one.
   """
   default = jax.sharding.SingleDeviceSharding(jax.devices()[0])
 
@@ -88,10 +116,8 @@ def abstract(tree: Any) -> Any:
     if not leaf.size:
       return None
     plain = jax.eval_shape(_key_data, leaf)
-    sharding = None if _is_key(leaf) else getattr(leaf, "sharding", None)
-    return jax.ShapeDtypeStruct(
-      plain.shape, plain.dtype, sharding=default if sharding is None else sharding
-    )
+    where = getattr(leaf, "sharding", None) or default
+    return jax.ShapeDtypeStruct(plain.shape, plain.dtype, sharding=where)
 
   return jax.tree.map(struct, tree)
 

@@ -31,13 +31,14 @@ def check_memory(needed: int, what: str, available: int | None = None) -> None:
 
 
 def available_memory() -> int | None:
-  """Bytes free where JAX puts arrays: device memory, else RAM; None if unknown."""
+  """Bytes free on each device: its memory, else its share of RAM; None if unknown."""
   import jax  # Here, because this starts its backend and takes a second to import.
 
   stats = jax.local_devices()[0].memory_stats() or {}
   if "bytes_limit" in stats:
     return stats["bytes_limit"] - stats.get("bytes_in_use", 0)
-  return host_memory()
+  host = host_memory()
+  return None if host is None else host // jax.local_device_count()
 
 
 def host_memory() -> int | None:

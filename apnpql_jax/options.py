@@ -49,6 +49,20 @@ class Train:
   algorithm: Annotated[str | None, _PRESET_HINT] = None
   """Short for --agent.algorithm; `apnpql list` names them."""
 
+  devices: int = 1
+  """Devices between which worlds and batches are split; 0: all, as several processes
+  always do."""
+
+  coordinator: str = ""
+  """Address and port of the first process, where several share the run: see
+  docs/scaling.md; auto: ask the batch system, which then knows the rest too."""
+
+  processes: Annotated[int | None, tyro.conf.arg(help_behavior_hint="")] = None
+  """How many processes share the run."""
+
+  process: Annotated[int | None, tyro.conf.arg(help_behavior_hint="")] = None
+  """Which of them this is, from 0."""
+
   json: _Flag = False
   """Print one JSON object on standard output and nothing else there."""
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 
+from apnpql_jax import sharding
 from apnpql_jax.agents.learner import Agent
 from apnpql_jax.config import TrainConfig
 from apnpql_jax.env import Env
@@ -20,6 +21,24 @@ from apnpql_jax.run_folder import RunFolder
 
 EVAL_SEED = 1
 """Evaluations during training always play the same held-out episodes."""
+
+
+class Silent:
+  """The reporter of processes that leave it to the first one."""
+
+  def __init__(self, folder: RunFolder):
+    """Nothing will be written into the folder."""
+    self.folder = folder
+    self.evaluation: dict[str, Any] = {}
+
+  def iteration(self, step: int, updates: int, metrics: dict[str, Any]) -> None:
+    """Does nothing."""
+
+  def evaluate(self, step: int, state: TrainState, *, last: bool) -> None:
+    """Does nothing."""
+
+  def write(self, step: int, figures: dict[str, Any]) -> None:
+    """Does nothing."""
 
 
 class Reporter:
@@ -54,11 +73,15 @@ class Reporter:
     self._writer.write(step, metrics)
     self._progress.update(step, updates=updates)
 
+  def write(self, step: int, figures: dict[str, Any]) -> None:
+    """Adds a row to the metrics."""
+    self._writer.write(step, figures)
+
   def evaluate(self, step: int, state: TrainState, *, last: bool) -> float:
     """Plays held-out episodes, writes their row, the curve and, at last, a video."""
     began = time.monotonic()
     config, folder = self._config, self.folder
-    params = state.learner.target_params
+    params = sharding.local(state.learner.target_params)
     figures = play_held_out(
       self._env, self._play, params, episodes=config.eval_episodes, seed=EVAL_SEED
     )

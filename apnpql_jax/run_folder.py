@@ -60,7 +60,9 @@ class RunFolder:
     return self.path / "faults"
 
 
-def create(run_dir: Path, config: TrainConfig, *, overwrite: bool = False) -> RunFolder:
+def create(
+  run_dir: Path, config: TrainConfig, *, overwrite: bool = False, devices: int = 1
+) -> RunFolder:
   """Makes the folder and writes ``config.json`` and ``versions.json`` into it.
 
   Raises:
@@ -68,7 +70,7 @@ def create(run_dir: Path, config: TrainConfig, *, overwrite: bool = False) -> Ru
       run, which is never removed; or it cannot be made.
   """
   runs.check_free(run_dir, overwrite=overwrite)
-  versions = json.dumps(describe_versions(), indent=2) + "\n"
+  versions = json.dumps(describe_versions(devices), indent=2) + "\n"
   with runs.fresh_run_dir(run_dir) as path:
     folder = RunFolder(path=path, config=config)
     write_text(folder.versions, versions)
@@ -88,7 +90,7 @@ def open_run(run_dir: Path) -> RunFolder:
   return RunFolder(path=run_dir.absolute(), config=runs.load_run_config(run_dir))
 
 
-def changed_versions(folder: RunFolder) -> list[str]:
+def changed_versions(folder: RunFolder, *, devices: int = 1) -> list[str]:
   """What differs between the record of a run and now, such as ``jax 0.9.1 -> 0.10.2``.
 
   A run resumed with other versions or another device learns on, but not bit by bit as
@@ -98,7 +100,7 @@ def changed_versions(folder: RunFolder) -> list[str]:
     old = _flat(json.loads(folder.versions.read_text(encoding="utf-8")))
   except (OSError, ValueError):
     return [f"{folder.versions.name} cannot be read"]
-  new = _flat(describe_versions())
+  new = _flat(describe_versions(devices))
   names = sorted((old.keys() | new.keys()) - {"created"})
   return [
     f"{name.rpartition('.')[2]} {old.get(name)} -> {new.get(name)}"
@@ -107,11 +109,10 @@ def changed_versions(folder: RunFolder) -> list[str]:
   ]
 
 
-def describe_versions() -> dict[str, Any]:
-  """Versions of Python and the packages, git commit of a checkout, device, time."""
+def describe_versions(devices: int) -> dict[str, Any]:
+  """Versions of Python and the packages, git commit of a checkout, devices, time."""
   import jax  # Here, so that naming a run folder does not start JAX.
 
-  devices = jax.devices()
   return {
     "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     "python": platform.python_version(),
@@ -120,8 +121,8 @@ def describe_versions() -> dict[str, Any]:
     "git": _git(Path(__file__).parent),
     "device": {
       "backend": jax.default_backend(),
-      "kind": devices[0].device_kind,
-      "count": len(devices),
+      "kind": jax.devices()[0].device_kind,
+      "count": devices,
     },
   }
 

@@ -12,10 +12,12 @@ import contextlib
 import io
 import os
 from pathlib import Path
+import re
 import sys
 
 MIN_THREADS = 4
-"""Smallest XLA:CPU thread pool in which two batched Cholesky calls cannot lock."""
+"""Smallest XLA:CPU thread pool in which two batched Cholesky calls cannot lock; the
+devices of a CPU that has been told to be several share one pool."""
 
 _DEFAULTS = {
   # On a GPU, XLA multiplies f32 matrices in TF32 (10 bits of mantissa) unless told
@@ -65,15 +67,23 @@ def _set_threads() -> None:
   # threads. With a pool of two, two such calls wait for each other for ever (seen
   # from 128 worlds upwards); with four they do not. XLA sizes the pool from these
   # variables, or from the number of cores.
-  pinned = False
+  least, pinned = MIN_THREADS * _cpu_devices(), False
   for name in ("PJRT_NPROC", "NPROC"):
     text = os.environ.get(name, "")
     if text.isdigit():
       pinned = True
-      if int(text) < MIN_THREADS:
-        os.environ[name] = str(MIN_THREADS)
-  if not pinned and cores() < MIN_THREADS:
-    os.environ["NPROC"] = str(MIN_THREADS)
+      if int(text) < least:
+        os.environ[name] = str(least)
+  if not pinned and cores() < least:
+    os.environ["NPROC"] = str(least)
+
+
+def _cpu_devices() -> int:
+  """How many devices JAX is to take the CPU for; one if nobody has asked for more."""
+  flag = r"xla_force_host_platform_device_count=(\d+)"
+  found = re.search(flag, os.environ.get("XLA_FLAGS", ""))
+  text = found[1] if found else os.environ.get("JAX_NUM_CPU_DEVICES", "")
+  return max(1, int(text)) if text.isdigit() else 1
 
 
 def cores() -> int:

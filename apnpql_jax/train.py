@@ -5,13 +5,16 @@ Everything needed to go on is in ``TrainState``; nothing here is.
 
 from __future__ import annotations
 
+from collections.abc import Generator
+import contextlib
 import dataclasses
 import logging
 from pathlib import Path
+import signal
 import sys
 from typing import Any
 
-import jax
+from jax.sharding import Mesh
 
 from apnpql_jax import (
   checkpoint,
@@ -23,6 +26,7 @@ from apnpql_jax import (
   resuming,
   run_folder,
   runs,
+  sharding,
 )
 from apnpql_jax.agents.learner import Agent, make_agent
 from apnpql_jax.checkpoint_writer import CheckpointWriter
@@ -33,13 +37,13 @@ from apnpql_jax.iteration import (
   ExpertReplay,
   TrainState,
   collect_expert,
-  empty_expert,
+  example_state,
   initial_state,
   make_iteration,
 )
 from apnpql_jax.metrics import MetricWriter
 from apnpql_jax.progress import TrainProgress
-from apnpql_jax.reporter import Reporter
+from apnpql_jax.reporter import Reporter, Silent
 from apnpql_jax.run_folder import RunFolder
 from apnpql_jax.runs import RunStopped
 from apnpql_jax.signals import Signals
@@ -58,7 +62,12 @@ class Start:
 
 
 def train(
-  config: TrainConfig, run_dir: Path, *, resume: bool = False, overwrite: bool = False
+  config: TrainConfig,
+  run_dir: Path,
+  *,
+  resume: bool = False,
+  overwrite: bool = False,
+  mesh: Mesh | None = None,
 ) -> dict[str, Any]:
   """Trains to ``config.total_steps``, or until a signal, then saves.
 
@@ -67,6 +76,7 @@ def train(
     run_dir: the run folder.
     resume: go on from the newest checkpoint of ``run_dir`` that is whole.
     overwrite: replace the run that ``run_dir`` holds, once the new one can start.
+    mesh: the devices to train on; the default one if None.
 
   Returns:
     the run folder, steps, updates and the last evaluation.
@@ -81,16 +91,17 @@ def train(
     "stopped before the first iteration was done; "
     + (to_go_on if resume else "nothing is saved")
   ) as signals:
-    start = _start(config, run_dir, resume=resume, overwrite=overwrite)
+    start = _start(config, run_dir, mesh, resume=resume, overwrite=overwrite)
     _say(f"run folder {start.folder.path}; compiling, which can take minutes")
     try:
       state, evaluation = _run(config, start, signals)
     except OSError as error:  # The disk is full or gone.
       raise RunStopped(f"{error}; {to_go_on}", runs.FAILED) from error
-  if signals.caught and int(state.env_steps) < config.total_steps:
+  if int(state.env_steps) < config.total_steps:
+    # The signal may have come to another process.
+    number = signals.caught[0] if signals.caught else signal.SIGTERM
     raise RunStopped(
-      f"saved at step {int(state.env_steps):,}; {to_go_on}",
-      runs.INTERRUPTED + signals.caught[0],
+      f"saved at step {int(state.env_steps):,}; {to_go_on}", runs.INTERRUPTED + number
     )
   return {
     "run": str(start.folder.path),
@@ -104,40 +115,67 @@ def _run(
   config: TrainConfig, start: Start, signals: Signals
 ) -> tuple[TrainState, dict[str, Any]]:
   """Opens what is written to, and trains; returns the last evaluation too."""
-  path, resume_step = start.folder.path, start.resume_step
-  if resume_step is not None and (aside := resuming.set_aside(path, resume_step)):
-    _say(f"later checkpoints, and the metrics until then, are now in {aside}")
-  sinks = make_sinks(config.sinks, path, dict(codec.flatten(config)))
+  sharding.first_alone(lambda: _set_aside(start))
   with (
-    MetricWriter(path, resume_step=resume_step, sinks=sinks) as writer,
-    CheckpointWriter(path, config, keep=config.keep_checkpoints) as saver,
-    TrainProgress(config.total_steps) as progress,
+    _reporting(config, start) as reporter,
+    CheckpointWriter(start.folder.path, config, keep=config.keep_checkpoints) as saver,
   ):
-    env, agent = start.env, start.agent
-    reporter = Reporter(config, env, agent, start.folder, writer, progress)
-    iteration = make_iteration(config, env, agent)
+    iteration: Any = make_iteration(config, start.env, start.agent)
+    if start.env.mesh is not None:
+      iteration = iteration.lower(start.state).compile()
+      sharding.meet()
     state = _loop(config, iteration, start.state, reporter, saver, signals)
     if figures := saver.finished(wait=True):
-      writer.write(int(state.env_steps), figures)
+      reporter.write(int(state.env_steps), figures)
   return state, reporter.evaluation
 
 
+@contextlib.contextmanager
+def _reporting(
+  config: TrainConfig, start: Start
+) -> Generator[Reporter | Silent, None, None]:
+  """Opens the metrics and the progress; of several processes, the first one tells."""
+  if not sharding.leads():
+    yield Silent(start.folder)
+    return
+  path = start.folder.path
+  sinks = make_sinks(config.sinks, path, dict(codec.flatten(config)))
+  with (
+    MetricWriter(path, resume_step=start.resume_step, sinks=sinks) as writer,
+    TrainProgress(config.total_steps) as progress,
+  ):
+    env = start.env.on_one_device()
+    yield Reporter(config, env, start.agent, start.folder, writer, progress)
+
+
+def _set_aside(start: Start) -> None:
+  path, step = start.folder.path, start.resume_step
+  if step is not None and (aside := resuming.set_aside(path, step)):
+    _say(f"later checkpoints, and the metrics until then, are now in {aside}")
+
+
 def _start(
-  config: TrainConfig, run_dir: Path, *, resume: bool, overwrite: bool
+  config: TrainConfig,
+  run_dir: Path,
+  mesh: Mesh | None,
+  *,
+  resume: bool,
+  overwrite: bool,
 ) -> Start:
   """Builds or restores everything; makes the folder last."""
   # What Orbax logs of a save that fails, tracebacks of each thread, is said by us.
   logging.getLogger("absl").setLevel(logging.CRITICAL)
   check_sinks(config.sinks)
+  devices = mesh.size if mesh else 1
   if resume:
     folder = run_folder.open_run(run_dir)
-    for change in run_folder.changed_versions(folder):
+    for change in run_folder.changed_versions(folder, devices=devices):
       _say(f"not as when the run began: {change}")
   saved = resume and checkpoint.latest_step(run_dir) is not None
   if saved:
     checkpoint.check(run_dir, None, config=config)
-  env, agent = make_env(config.env), make_agent(config.agent)
-  example = jax.eval_shape(lambda: initial_state(config, env, agent, empty_expert))
+  env, agent = make_env(config.env, mesh), make_agent(config.agent)
+  example = example_state(config, env, agent)
   memory.check_memory(leaves.nbytes(example), "the training state")
   if saved:
     state = resuming.restore(config, run_dir, example, _say)
@@ -146,8 +184,10 @@ def _start(
   if resume:
     _say("it was stopped before its first checkpoint, and begins again")
     return Start(env, agent, folder, state, 0)
-  folder = run_folder.create(run_dir, config, overwrite=overwrite)
-  return Start(env, agent, folder, state, None)
+  sharding.first_alone(
+    lambda: run_folder.create(run_dir, config, overwrite=overwrite, devices=devices)
+  )
+  return Start(env, agent, run_folder.open_run(run_dir), state, None)
 
 
 def _expert(config: TrainConfig, env: Env) -> ExpertReplay:
@@ -163,8 +203,8 @@ def _expert(config: TrainConfig, env: Env) -> ExpertReplay:
 
 def _loop(config, iteration, state, reporter, saver, signals) -> TrainState:
   """Iterates to the last step; evaluates and saves whenever a multiple is passed."""
-  step = int(state.env_steps)
-  while step < config.total_steps and not signals.caught:
+  step, stop = int(state.env_steps), False
+  while step < config.total_steps and not stop:
     before = step
     state, metrics = iteration(state)
     step = int(state.env_steps)
@@ -174,9 +214,11 @@ def _loop(config, iteration, state, reporter, saver, signals) -> TrainState:
     done = step >= config.total_steps
     rate = None
     # Who sends a signal may not wait for an evaluation before the state is safe.
-    if not signals.caught and (done or _passed(before, step, config.eval_every)):
+    stop = sharding.anywhere(signals.caught)
+    if not stop and (done or _passed(before, step, config.eval_every)):
       rate = reporter.evaluate(step, state, last=done)
-    last = done or bool(signals.caught)
+      stop = sharding.anywhere(signals.caught)
+    last = done or stop
     whole = _passed(before, step, config.save_replay_every or config.checkpoint_every)
     if last or whole or _passed(before, step, config.checkpoint_every):
       items = resuming.to_items(state, whole=last or whole or saver.empty)
@@ -185,7 +227,8 @@ def _loop(config, iteration, state, reporter, saver, signals) -> TrainState:
 
 
 def _say(text: str) -> None:
-  print(text, file=sys.stderr, flush=True)
+  if sharding.leads():
+    print(text, file=sys.stderr, flush=True)
 
 
 def _passed(before: int, now: int, every: int) -> bool:

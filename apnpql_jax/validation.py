@@ -76,6 +76,7 @@ def validate(
   tasks: Sequence[str] | None = None,
   algorithms: Mapping[str, bool] | None = None,
   memory_bytes: int | None = None,
+  devices: int = 1,
 ) -> None:
   """Refuses a configuration that cannot work, before anything is built.
 
@@ -84,7 +85,8 @@ def validate(
     tasks: valid task names; not checked if None.
     algorithms: valid algorithm names, with True where candidates are weighed, so that
       they bound epsilon; not checked if None.
-    memory_bytes: memory the replays must fit into; not checked if None.
+    memory_bytes: memory of a device the replays must fit into; not checked if None.
+    devices: between how many worlds and batches are split.
 
   Raises:
     ConfigError: one line that names the setting and the valid choices or the fix.
@@ -101,7 +103,13 @@ def validate(
   limited = config.agent.temperature != "fixed"
   if limited and algorithms is not None and algorithms[config.agent.algorithm]:
     _validate_epsilon(config.agent)
-  _validate_replay(config, memory_bytes)
+  _validate_replay(config, None if memory_bytes is None else memory_bytes * devices)
+  for name, number in (
+    ("env.worlds", config.env.worlds),
+    ("replay.batch_size", config.replay.batch_size),
+  ):
+    if number % devices:
+      raise ConfigError(f"{name}={number} must be a multiple of the {devices} devices")
 
 
 def check_name(field: str, value: str, valid: Sequence[str]) -> None:
@@ -269,7 +277,7 @@ def _validate_replay(config: TrainConfig, memory_bytes: int | None) -> None:
   need = replay_bytes(config)
   if memory_bytes is not None and need > memory_bytes:
     raise ConfigError(
-      f"the replays need {need / 2**30:.1f} GiB but this machine has "
+      f"the replays need {need / 2**30:.1f} GiB but the devices have "
       f"{memory_bytes / 2**30:.1f} GiB; lower replay.capacity or "
       "replay.expert_steps"
     )

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 import numpy as np
-from peer_ours import random_policy
+from parts import random_policy
 
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.cameras import make_cameras

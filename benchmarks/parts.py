@@ -40,12 +40,17 @@ class Part(NamedTuple):
 
 
 def random_policy(state: EnvState, key: Array) -> tuple[Array, Array]:
-  """Actions uniform over the action box, as a ``rollout.Policy``."""
+  """Random actions as a ``rollout.Policy``."""
   worlds = state.elapsed.shape[0]
+  return random_actions(key, worlds), jnp.zeros(worlds)
+
+
+def random_actions(key: Array, worlds: int) -> Array:
+  """f32[worlds, 7], uniform over the action box."""
   arm_key, grip_key = jax.random.split(key)
   velocity = jax.random.uniform(arm_key, (worlds, ARM_DOF), minval=-1.0, maxval=1.0)
   close = jax.random.bernoulli(grip_key, shape=(worlds, 1)).astype(jnp.float32)
-  return jnp.concatenate([velocity, close], axis=-1), jnp.zeros(worlds)
+  return jnp.concatenate([velocity, close], axis=-1)
 
 
 def draw(env: Env, config: EnvConfig, physics: PhysicsState) -> list[Array]:
@@ -57,7 +62,7 @@ def measure(
   env: Env, agent: Agent, params: Any, state: EnvState, *, repeats: int
 ) -> dict[str, Part]:
   """Times the parts of a period from the instant ``state``."""
-  action, _ = random_policy(state, jax.random.key(0))
+  action = random_actions(jax.random.key(0), state.elapsed.shape[0])
   velocity, close = action[:, :ARM_DOF], action[:, ARM_DOF]
   moving = (state.physics, velocity, close)
   work = physics_work(env.physics, state.physics)

@@ -16,6 +16,7 @@ import apnpql_jax  # noqa: F401  isort: skip  (before JAX: sets threads and cach
 from cures import cures
 import jax
 import jax.numpy as jnp
+import parts
 from peer_worlds import EPISODE_STEPS
 import sides
 import tables
@@ -42,10 +43,10 @@ def worlds(settings: dict[str, Any]) -> dict[str, sides.Measure]:
 
   @jax.jit
   def whole(state: EnvState, key: Array) -> EnvState:
-    return rollout(env, random_policy, state, key, length=periods)[0]
+    return rollout(env, parts.random_policy, state, key, length=periods)[0]
 
   def period(state: Any, key: Array) -> tuple[Any, None]:
-    action = random_actions(key, config.worlds)
+    action = parts.random_actions(key, config.worlds)
     return env.physics.step(state, action[:, :6], action[:, 6]), None
 
   @jax.jit
@@ -93,18 +94,6 @@ def learner_config(settings: dict[str, Any]) -> AgentConfig:
     # Epsilon must stay below the log of the candidates; it costs no time.
     epsilon=min(config.epsilon, 1.0),
   )
-
-
-def random_policy(state: EnvState, key: Array) -> tuple[Array, Array]:
-  """Any action is as likely as any other, as a ``rollout.Policy``."""
-  count = state.elapsed.shape[0]
-  return random_actions(key, count), jnp.zeros(count)
-
-
-def random_actions(key: Array, count: int) -> Array:
-  """f32[count, 7]."""
-  draws = jax.random.uniform(key, (count, 7), minval=-1.0)
-  return draws.at[:, 6].set((draws[:, 6] > 0).astype(jnp.float32))
 
 
 def _played(

@@ -53,6 +53,8 @@ def threads(env: dict[str, str], cores: int) -> int:
     ({"PJRT_NPROC": "1"}, 4),
     ({"NPROC": "1", "PJRT_NPROC": "2"}, 4),
     ({"NPROC": "8"}, 8),
+    ({"XLA_FLAGS": "--xla_force_host_platform_device_count=3", "NPROC": "8"}, 12),
+    ({"JAX_NUM_CPU_DEVICES": "2"}, 8),
   ],
 )
 def test_pool_has_at_least_four_threads(given, least):

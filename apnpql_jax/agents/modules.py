@@ -40,7 +40,7 @@ class ValueHead(nn.Module):
   """Z_eta: values of many candidate actions of one state.
 
   The first layer is W_phi phi + W_a a; the large half is computed once per state.
-  All further layers see one flat batch, which is one matrix product per layer.
+  Candidates and states stay apart, so that devices can divide the states.
   """
 
   hidden: Sequence[int]
@@ -54,14 +54,13 @@ class ValueHead(nn.Module):
     from_phi = nn.Dense(width, name="phi")(phi)
     centred = actions.at[..., -1].set(2.0 * actions[..., -1] - 1.0)
     x = nn.Dense(width, use_bias=False, name="action")(centred) + from_phi[None]
-    x = nn.relu(x).reshape(-1, width)
+    x = nn.relu(x)
     for width in rest:
       x = nn.relu(nn.Dense(width)(x))
     initial = jnp.asarray(self.initial)
-    outputs = nn.Dense(
+    return nn.Dense(
       initial.size, kernel_init=_small, bias_init=lambda *_: initial, name="out"
     )(x)
-    return outputs.reshape(*actions.shape[:-1], initial.size)
 
 
 class TwinValueHeads(nn.Module):

@@ -29,8 +29,9 @@ class Kinematics(struct.PyTreeNode):
 def make_kinematics(scene: Scene) -> Callable[[PhysicsState], Kinematics]:
   """Returns ``f(state) -> Kinematics`` over [worlds, ...], one path for all engines."""
   patch_mjx()
-  model = mjx.put_model(scene.model, impl="jax")
-  template = mjx.make_data(scene.model, impl="jax")
+  device = jax.local_devices()[0]  # MJX would take the first one of all processes.
+  model = mjx.put_model(scene.model, device, impl="jax")
+  template = mjx.make_data(scene.model, device, impl="jax")
 
   def single(qpos, mocap_pos, mocap_quat, fields) -> Kinematics:
     world = model.replace(**model_fields(fields))

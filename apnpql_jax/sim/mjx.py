@@ -27,8 +27,9 @@ class MjxPhysics:
     patch_mjx()
     self.scene = scene
     self._substeps = substeps
-    self._model = mjx.put_model(scene.model, impl="jax")
-    self._template = mjx.make_data(scene.model, impl="jax")
+    device = jax.local_devices()[0]  # MJX would take the first one of all processes.
+    self._model = mjx.put_model(scene.model, device, impl="jax")
+    self._template = mjx.make_data(scene.model, device, impl="jax")
     self._torque_limit = jnp.asarray(scene.model.actuator_ctrlrange[:6, 1], jnp.float32)
 
   def step(self, state: PhysicsState, velocity: Array, close: Array) -> PhysicsState:
