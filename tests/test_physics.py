@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -11,6 +14,7 @@ import pytest
 from apnpql_jax.config import ConfigError
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.kinematics import make_kinematics
+from apnpql_jax.sim.mjx import MjxPhysics
 from apnpql_jax.sim.scene import load_scene
 
 ENGINES = ("native", "mjx")
@@ -62,6 +66,28 @@ def test_a_sliding_plate_stops_as_coulomb_says(engines, task, resets, name: str)
   np.testing.assert_allclose(way[:, 0], speed**2 / (2 * friction * 9.81), rtol=0.1)
   np.testing.assert_allclose(way[:, 1:], 0.0, atol=2e-3)
   assert np.abs(state.qvel[:, dof : dof + 3]).max() < 0.02
+
+
+def test_velocities_follow_the_accelerations_of_a_solver_that_has_not_converged(
+  task, resets
+):
+  """After one iteration forces are far from those that belong to the accelerations, and
+  the plate's inertia is small enough for the rest to throw it."""
+  model = copy.copy(task.scene.model)
+  model.opt.iterations = 1
+  scene = dataclasses.replace(task.scene, model=model)
+  engine = MjxPhysics(scene, substeps=1)
+  worlds = resets.qpos.shape[0]
+  plate, dof = task.scene.free_joint("plate")
+  speed = np.random.default_rng(0).normal(size=(worlds, 6)) * 0.3
+  state = resets.replace(
+    qpos=resets.qpos.at[:, plate + 2].add(-0.002),
+    qvel=resets.qvel.at[:, dof : dof + 6].set(speed),
+  )
+  after = jax.jit(engine.step)(state, jnp.zeros((worlds, 6)), jnp.zeros(worlds))
+  gained = np.asarray(after.qvel - state.qvel)[:, dof : dof + 6]
+  expected = model.opt.timestep * np.asarray(after.qacc_warmstart)[:, dof : dof + 6]
+  np.testing.assert_allclose(gained, expected, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", ENGINES)

@@ -89,4 +89,9 @@ class MjxPhysics:
     )
     data = data.replace(ctrl=jnp.append(torque, finger))
     data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
-    return mjx.implicit(model, mjx.solve(model, data))
+    data = mjx.solve(model, data)
+    # In float32 the solver can stop while forces and accelerations do not quite belong
+    # together. The integrator takes the forces, and what is left over throws a light
+    # object away: so they are made those of the accelerations.
+    force = mjx.mul_m(model, data, data.qacc) - data.qfrc_smooth
+    return mjx.implicit(model, data.replace(qfrc_constraint=force))
