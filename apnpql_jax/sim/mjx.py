@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import mujoco
 from mujoco import mjx
 
 from apnpql_jax.sim import physics
@@ -27,6 +28,8 @@ class MjxPhysics:
     patch_mjx()
     self.scene = scene
     self._substeps = substeps
+    joints = scene.model.jnt_type[scene.model.dof_jntid]
+    self._free = joints == mujoco.mjtJoint.mjJNT_FREE
     device = jax.local_devices()[0]  # MJX would take the first one of all processes.
     self._model = mjx.put_model(scene.model, device, impl="jax")
     self._template = mjx.make_data(scene.model, device, impl="jax")
@@ -92,6 +95,7 @@ class MjxPhysics:
     data = mjx.solve(model, data)
     # In float32 the solver can stop while forces and accelerations do not quite belong
     # together. The integrator takes the forces, and what is left over throws a light
-    # object away: so they are made those of the accelerations.
+    # object away: so those of free bodies are made to be those of the accelerations.
     force = mjx.mul_m(model, data, data.qacc) - data.qfrc_smooth
+    force = jnp.where(self._free, force, data.qfrc_constraint)
     return mjx.implicit(model, data.replace(qfrc_constraint=force))
