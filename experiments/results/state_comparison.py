@@ -95,10 +95,7 @@ def table(found: dict[tuple[str, str], list[list[dict[str, float]]]]) -> str:
   ]
   for (task, algorithm), runs in found.items():
     final = ", ".join(f"{100 * rows[-1]['eval/success_rate']:.0f}" for rows in runs)
-    above = [
-      [r["step"] for r in rows if r["eval/success_rate"] >= GOAL] for rows in runs
-    ]
-    steps = ", ".join(f"{hits[0]:,.0f}" if hits else "never" for hits in above)
+    steps = ", ".join(map(_steps_to_goal, runs))
     lines.append(f"| {task} | {algorithm} | {final} | {steps} |")
   return "\n".join(lines) + "\n"
 
