@@ -25,7 +25,7 @@ from apnpql_jax.rollout import expert_policy
 from apnpql_jax.tasks import make_task, task_names
 
 RESULT = Path(__file__).resolve().parent / "results" / "solver.json"
-SETTINGS = ["20x20", "8x20", "8x15", "20x10", "10x10", "5x20"]
+SETTINGS = ["20x20", "10x10", "5x10", "5x5", "3x10"]
 
 
 def main() -> None:
