@@ -208,8 +208,9 @@ def _loop(config, iteration, state, reporter, saver, signals) -> TrainState:
     before = step
     state, metrics = iteration(state)
     step = int(state.env_steps)
-    reporter.iteration(step, int(state.learner.step), metrics | saver.finished())
+    # Before it is told that an iteration is done, for then there is something to save.
     signals.finish_first(f"stopped at once; to go on: --resume {reporter.folder.path}")
+    reporter.iteration(step, int(state.learner.step), metrics | saver.finished())
     faults.check(config, state, reporter.folder)
     done = step >= config.total_steps
     rate = None

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from apnpql_jax import demonstrations
+from apnpql_jax import demonstrations, metrics
 from apnpql_jax.config import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
 from apnpql_jax.primitives.bank import load_bank
 from apnpql_jax.tasks import make_task
@@ -101,8 +101,8 @@ def write_demonstrations(path: Path) -> None:
 
 def rows(run_dir: Path) -> list[dict[str, Any]]:
   """Whole rows of the metrics of a run; none if it has not begun."""
-  path = run_dir / "metrics.jsonl"
-  lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+  files = [path for path in metrics.metric_files(run_dir) if path.exists()]
+  lines = [line for path in files for line in path.read_text().splitlines(True)]
   return [json.loads(line) for line in lines if line.endswith("\n")]
 
 
