@@ -137,7 +137,10 @@ def _candidates(run_dir: Path, step: int | None) -> list[int]:
 
 
 def _check_config(name: str, saved: Any, wanted: TrainConfig) -> None:
-  diff = config_diff(config_from_json(json.dumps(saved)), wanted)
+  try:
+    diff = config_diff(config_from_json(json.dumps(saved)), wanted)
+  except ConfigError as error:
+    raise ConfigError(f"{name}: {error}") from None
   diff = {field: pair for field, pair in diff.items() if field not in MAY_CHANGE}
   if diff:
     raise ConfigError(f"{name} belongs to other settings: {format_diff(diff)}")

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 import contextlib
 from pathlib import Path
 import shutil
 
+from apnpql_jax import codec
 from apnpql_jax.config import (
   ConfigError,
   TrainConfig,
@@ -58,8 +59,14 @@ def new_run_dir(preset: str, root: Path = Path("runs")) -> Path:
   return root / f"{preset}-{number}"
 
 
-def load_run_config(run_dir: Path) -> TrainConfig:
+def load_run_config(
+  run_dir: Path, say: Callable[[str], None] = codec.unsaid
+) -> TrainConfig:
   """The configuration that a run was started with.
+
+  Args:
+    run_dir: the run folder.
+    say: is told in one line which settings came after the run, if any.
 
   Raises:
     ConfigError: not a run folder, or its configuration cannot be read.
@@ -71,7 +78,8 @@ def load_run_config(run_dir: Path) -> TrainConfig:
       f"{_nearby_runs(run_dir)}"
     )
   try:
-    return config_from_json(read_small(path, _MAX_CONFIG_BYTES))
+    text = read_small(path, _MAX_CONFIG_BYTES)
+    return config_from_json(text, lambda line: say(f"{path} is {line}"))
   except ConfigError as error:
     raise ConfigError(f"{path}: {error}") from None
   except (OSError, ValueError) as error:

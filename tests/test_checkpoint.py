@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import dataclasses
 import gc
+import json
 from pathlib import Path
 import resource
 import shutil
@@ -21,7 +23,7 @@ import pytest
 
 from apnpql_jax import checkpoint, checkpoint_record, resuming
 from apnpql_jax.checkpoint_writer import CheckpointWriter, SaveError
-from apnpql_jax.config import AgentConfig, ConfigError, TrainConfig
+from apnpql_jax.config import AgentConfig, ConfigError, TrainConfig, config_to_json
 
 CONFIG = TrainConfig()
 
@@ -167,6 +169,30 @@ def test_other_settings_are_refused_by_name(tmp_path: Path):
   assert "\n" not in str(error.value)
   longer = dataclasses.replace(CONFIG, total_steps=10**6, video=False)
   _restore(tmp_path, 1, _state(), config=longer)
+
+
+def test_a_checkpoint_from_before_a_setting_is_read_as_it_was(
+  tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+  def as_then(*lacking: str) -> Callable[[TrainConfig], str]:
+    def to_json(config: TrainConfig) -> str:
+      data = json.loads(config_to_json(config))
+      kept = {k: v for k, v in data["agent"].items() if k not in lacking}
+      return json.dumps(data | {"agent": kept})
+
+    return to_json
+
+  monkeypatch.setattr(checkpoint_record, "config_to_json", as_then("residual_blocks"))
+  _save(tmp_path, (1, _state(1), None))
+  _assert_same_bits(_restore(tmp_path, 1, _state(), config=CONFIG), _state(1))
+  deeper = dataclasses.replace(CONFIG, agent=AgentConfig(residual_blocks=2))
+  with pytest.raises(ConfigError, match="agent.residual_blocks 0 -> 2"):
+    _restore(tmp_path, 1, _state(), config=deeper)
+  # A setting that was always there cannot be missing.
+  monkeypatch.setattr(checkpoint_record, "config_to_json", as_then("gamma"))
+  _save(tmp_path, (2, _state(2), None))
+  with pytest.raises(ConfigError, match="checkpoint 2 of .*'agent.gamma' is missing"):
+    _restore(tmp_path, None, _state(), config=CONFIG)
 
 
 def test_other_leaves_are_refused_by_name(tmp_path: Path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 
 import pytest
@@ -28,6 +29,29 @@ def test_new_run_dir_takes_the_first_free_number(tmp_path):
 def test_configuration_of_a_run_is_read_back(tmp_path):
   config = TrainConfig(seed=3, agent=AgentConfig(gamma=0.9))
   assert runs.load_run_config(write_run(tmp_path / "a", config)) == config
+
+
+def test_a_run_made_before_a_setting_came_is_read_and_that_is_said(tmp_path):
+  config = TrainConfig(seed=3, agent=AgentConfig(gamma=0.9))
+  run = write_run(tmp_path / "a", config)
+  data = json.loads((run / "config.json").read_text())
+  del data["agent"]["residual_blocks"]
+  (run / "config.json").write_text(json.dumps(data))
+  said: list[str] = []
+  assert runs.load_run_config(run, said.append) == config
+  assert said == [
+    f"{run}/config.json is older than some settings, which are as before: "
+    "agent.residual_blocks 0"
+  ]
+  # It is resumed as it was, and only so.
+  runs.check_resumable(run, config)
+  blocks = dataclasses.replace(config.agent, residual_blocks=1)
+  with pytest.raises(ConfigError, match="agent.residual_blocks 0 -> 1"):
+    runs.check_resumable(run, dataclasses.replace(config, agent=blocks))
+  del data["agent"]["n_step"]
+  (run / "config.json").write_text(json.dumps(data))
+  with pytest.raises(ConfigError, match="config.json: .*'agent.n_step' is missing"):
+    runs.load_run_config(run, pytest.fail)
 
 
 def test_configuration_that_is_not_text_is_refused(tmp_path):
