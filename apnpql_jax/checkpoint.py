@@ -171,4 +171,7 @@ def _restore_item(run_dir: Path, step: int, item: str, example: Any) -> Any:
     raise DamagedError(f"{name} cannot be read: {first_line(error)}") from error
   checkpoint_record.check_bits(name, saved, tree)
   impls = {path: leaf.key_impl for path, leaf in saved.items() if leaf.key_impl}
-  return leaves.to_typed(tree, impls, example)
+  try:
+    return leaves.to_typed(tree, impls, example)
+  except (TypeError, ValueError) as error:
+    raise DamagedError(f"{name} cannot be read: {first_line(error)}") from None

@@ -15,6 +15,7 @@ import time
 from typing import Any
 
 from flax import struct
+from hypothesis import given, settings, strategies as st
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -288,6 +289,45 @@ def test_damage_is_recognised_named_and_the_one_before_taken(tmp_path: Path, dam
     shutil.rmtree(run)
   assert refused == {"meta", "state"}
   gc.collect()  # What Orbax left would complain in another test.
+
+
+VALUE = st.integers() | st.floats() | st.booleans() | st.none() | st.text()
+DEEPER = st.sampled_from([True, True, True, False])
+
+
+@pytest.fixture(scope="module")
+def foreign(tmp_path_factory) -> Path:
+  """A run to whose record somebody else has the pen."""
+  run = tmp_path_factory.mktemp("foreign")
+  _save(run, (1, _state(1), 0.5))
+  return run
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.data())
+def test_a_record_that_somebody_wrote_is_refused_in_one_line_or_right(foreign, data):
+  """One value of it in place of another, with a checksum that fits."""
+  path = foreign / "checkpoints" / "1" / "meta" / "metadata"
+  whole = path.read_text()
+  record = json.loads(whole)
+  del record["crc32"]
+  inside, key = record, data.draw(st.sampled_from(sorted(record)))
+  while isinstance(inside[key], dict | list) and inside[key] and data.draw(DEEPER):
+    inside = inside[key]
+    keys = sorted(inside) if isinstance(inside, dict) else range(len(inside))
+    key = data.draw(st.sampled_from(keys))
+  inside[key] = data.draw(VALUE | st.lists(VALUE) | st.just({}))
+  record["crc32"] = checkpoint_record._checksum(record)
+  path.write_text(json.dumps(record))
+  try:
+    found = checkpoint.restore(foreign, None, {"state": _state()}, config=CONFIG)
+  except ConfigError as error:
+    assert len(str(error)) < 2000
+  else:
+    _assert_same_bits(found.items["state"], _state(1))
+    checkpoint.best_step(foreign)
+  finally:
+    path.write_text(whole)
 
 
 def test_without_a_whole_checkpoint_each_is_named(tmp_path: Path):
