@@ -167,6 +167,18 @@ def test_an_iteration_is_a_function_of_its_state(iteration, state):
   assert _bits(other[0].learner) != _bits(first[0].learner)
 
 
+def test_another_seed_is_another_run(built):
+  agent = make_agent(built.config.agent)
+  one, other = (
+    initial_state(
+      dataclasses.replace(built.config, seed=seed), built.env, agent, empty_expert
+    )
+    for seed in (0, 1)
+  )
+  for part in ("learner", "env", "key"):
+    assert _bits(getattr(one, part)) != _bits(getattr(other, part))
+
+
 def _save(run: Path, built: Built, *states: tuple[TrainState, bool]) -> None:
   with CheckpointWriter(run, built.config, keep=9) as writer:
     for state, whole in states:
