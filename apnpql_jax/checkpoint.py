@@ -137,7 +137,10 @@ def _candidates(run_dir: Path, step: int | None) -> list[int]:
 
 
 def _check_config(name: str, saved: Any, wanted: TrainConfig) -> None:
-  diff = config_diff(config_from_json(json.dumps(saved)), wanted)
+  try:
+    diff = config_diff(config_from_json(json.dumps(saved)), wanted)
+  except ConfigError as error:
+    raise ConfigError(f"{name}: {error}") from None
   diff = {field: pair for field, pair in diff.items() if field not in MAY_CHANGE}
   if diff:
     raise ConfigError(f"{name} belongs to other settings: {format_diff(diff)}")
@@ -168,4 +171,7 @@ def _restore_item(run_dir: Path, step: int, item: str, example: Any) -> Any:
     raise DamagedError(f"{name} cannot be read: {first_line(error)}") from error
   checkpoint_record.check_bits(name, saved, tree)
   impls = {path: leaf.key_impl for path, leaf in saved.items() if leaf.key_impl}
-  return leaves.to_typed(tree, impls, example)
+  try:
+    return leaves.to_typed(tree, impls, example)
+  except (TypeError, ValueError) as error:
+    raise DamagedError(f"{name} cannot be read: {first_line(error)}") from None

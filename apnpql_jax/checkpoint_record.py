@@ -78,7 +78,7 @@ def read(run_dir: Path, step: int) -> Record:
     whole = crc32 == _checksum(record)
     if version != SCHEMA_VERSION and (whole or crc32 is None):
       raise ConfigError(
-        f"{name} has format {version}; this code reads {SCHEMA_VERSION}"
+        f"{name} has format {str(version)[:20]}; this code reads {SCHEMA_VERSION}"
       )
     if not whole:
       raise DamagedError(f"{name} is damaged: its record is not what was saved")
@@ -86,7 +86,8 @@ def read(run_dir: Path, step: int) -> Record:
       item: {path: Leaf(*leaf) for path, leaf in tree.items()}
       for item, tree in record["items"].items()
     }
-    return Record(record["config"], record["success_rate"], items)
+    rate = record["success_rate"]
+    return Record(record["config"], None if rate is None else float(rate), items)
   except ConfigError:
     raise
   except (

@@ -129,17 +129,18 @@ class CheckpointWriter:
     self._saving = None
 
   def close(self) -> None:
-    """Waits as ``wait`` does, then lets go of the run."""
-    try:
-      self.wait()
-    finally:
-      self._manager.close()
+    """Waits as ``wait`` does, then lets go of the run.
+
+    Not if that fails: threads of a save that failed half-way can wait for each other
+    for minutes.
+    """
+    self.wait()
+    self._manager.close()
 
   def __enter__(self) -> CheckpointWriter:
     return self
 
   def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
-    # Threads of a save that failed half-way can wait for each other for minutes.
     if kind is None or not issubclass(kind, SaveError):
       self.close()
 

@@ -5,16 +5,28 @@ Knows nothing of what the fields mean; ``config`` holds the dataclasses themselv
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 import dataclasses
 import json
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 T = TypeVar("T")
 
+_BEFORE = "before"
+"""In the metadata of a field: its value in texts that were written without it."""
+
 
 class ConfigError(ValueError):
   """A setting that cannot work; its one-line message says what to write instead."""
+
+
+def added(value: Any) -> Any:
+  """A field that came when texts without it existed.
+
+  Args:
+    value: its default, which must mean what was done before there was such a field.
+  """
+  return dataclasses.field(default=value, metadata={_BEFORE: value})
 
 
 def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -32,8 +44,17 @@ def to_json(config: Any) -> str:
   return json.dumps(dataclasses.asdict(config), indent=2) + "\n"
 
 
-def from_json(cls: type[T], text: str) -> T:
+def unsaid(line: str) -> None:
+  """For those who do not want to be told."""
+
+
+def from_json(cls: type[T], text: str, say: Callable[[str], None] = unsaid) -> T:
   """Reads what ``to_json`` wrote; only data, nothing is executed.
+
+  Args:
+    cls: the dataclass.
+    text: may have been written before the fields that are ``added``.
+    say: is told in one line which these are, if any.
 
   Raises:
     ConfigError: not JSON, or a key is unknown, missing, or of the wrong type.
@@ -42,11 +63,18 @@ def from_json(cls: type[T], text: str) -> T:
     data = json.loads(text, parse_constant=_refuse_constant)
   except (ValueError, RecursionError) as error:
     raise ConfigError(f"config is not valid JSON: {str(error)[:200]}") from None
-  return _build(cls, data, "")
+  lacking: list[str] = []
+  config = _build(cls, data, "", lacking)
+  if lacking:
+    say(f"older than some settings, which are as before: {', '.join(lacking)}")
+  return config
 
 
-def _build(cls: type[T], data: Any, path: str) -> T:
-  """An instance of dataclass ``cls`` from parsed JSON, every key accounted for."""
+def _build(cls: type[Any], data: Any, path: str, lacking: list[str]) -> Any:
+  """An instance of dataclass ``cls`` from parsed JSON, every key accounted for.
+
+  Appends to ``lacking`` the fields that are missing for good reason.
+  """
   if not isinstance(data, dict):
     raise ConfigError(f"config field {path or 'top level'} must be an object")
   prefix = path + "." if path else ""
@@ -56,17 +84,25 @@ def _build(cls: type[T], data: Any, path: str) -> T:
       raise ConfigError(
         f"unknown config field {prefix + key!r}; valid: {', '.join(hints)}"
       )
-  for key in hints:
-    if key not in data:
-      raise ConfigError(f"config field {prefix + key!r} is missing")
-  return cls(**{k: _value(hints[k], v, prefix + k) for k, v in data.items()})
+  values = {}
+  for field in dataclasses.fields(cls):
+    key, name = field.name, prefix + field.name
+    if key in data:
+      values[key] = _value(hints[key], data[key], name, lacking)
+    elif _BEFORE in field.metadata:
+      values[key] = before = field.metadata[_BEFORE]
+      group = dataclasses.is_dataclass(before)
+      lacking.append(name if group else f"{name} {before}")
+    else:
+      raise ConfigError(f"config field {name!r} is missing")
+  return cls(**values)
 
 
-def _value(hint: Any, value: Any, path: str) -> Any:
+def _value(hint: Any, value: Any, path: str, lacking: list[str]) -> Any:
   if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-    return _build(hint, value, path)
+    return _build(hint, value, path, lacking)
   if get_origin(hint) is tuple and isinstance(value, list):
-    return tuple(_value(get_args(hint)[0], item, path) for item in value)
+    return tuple(_value(get_args(hint)[0], item, path, lacking) for item in value)
   # bool is an int to Python, and a whole float is written without its point by
   # other JSON writers: the first is refused, the second is read.
   if hint is float and type(value) is int:

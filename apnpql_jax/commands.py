@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 import dataclasses
 from pathlib import Path
+import sys
 from typing import TYPE_CHECKING, Any
 
 from apnpql_jax import presets, runs
@@ -38,7 +39,7 @@ def train(args: Train, argv: Sequence[str]) -> Json:
   if args.preset:
     base = presets.load_preset(args.preset)
   else:
-    base = runs.load_run_config(args.resume or Path())
+    base = runs.load_run_config(args.resume or Path(), _tell)
   # Parsed a second time, now on top of the settings asked for.
   args = parse(Train, "train", argv, default=Train(config=base))
   config = _with_shortcuts(args)
@@ -72,7 +73,7 @@ def evaluate(args: Evaluate, argv: Sequence[str]) -> Json:
   _check_episodes(args.episodes, args.seed)
   if args.backend is not None:
     check_name("backend", args.backend, BACKENDS)
-  runs.load_run_config(Path(args.run))
+  runs.load_run_config(Path(args.run), _tell)
 
   from apnpql_jax.evaluate import evaluate_run
 
@@ -139,7 +140,7 @@ def repeat(args: Repeat, argv: Sequence[str]) -> Json:
   if not args.file:
     raise ConfigError("repeat needs a file: apnpql repeat RUN/faults/step_<n>.npz")
   path = Path(args.file).absolute()
-  runs.load_run_config(path.absolute().parent.parent)
+  runs.load_run_config(path.parent.parent, _tell)
 
   from apnpql_jax import faults
 
@@ -211,6 +212,10 @@ def _checkpoint_step(args: Evaluate) -> int | None:
   raise ConfigError(
     f"unknown --checkpoint {args.checkpoint!r}; choose from newest, best, or its steps"
   )
+
+
+def _tell(line: str) -> None:
+  print(line, file=sys.stderr, flush=True)
 
 
 def _check_episodes(episodes: int, seed: int) -> None:

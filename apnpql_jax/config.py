@@ -1,11 +1,14 @@
 """Settings of a training run: frozen dataclasses, to and from JSON.
 
-Every field has a docstring because the command line shows it as help. This module
-imports neither JAX nor MuJoCo, so that ``apnpql --help`` is instant.
+Every field has a docstring because the command line shows it as help. A field that is
+``added`` came after the present format of checkpoints: older runs, which lack it, can
+still be resumed and evaluated. This module imports neither JAX nor MuJoCo, so that
+``apnpql --help`` is instant.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import dataclasses
 import math
 from typing import Any
@@ -105,21 +108,19 @@ class EnvConfig:
   bank_rows: int = 2048
   """Reset states kept in the bank of a task (built once, cached on disk)."""
 
-  global_size: tuple[int, int] = (72, 96)
+  global_size: tuple[int, int] = codec.added((72, 96))
   """Height and width of the global camera's image in pixels."""
 
-  wrist_size: tuple[int, int] = (36, 64)
+  wrist_size: tuple[int, int] = codec.added((36, 64))
   """Height and width of the wrist camera's image in pixels."""
 
-  shadows: bool = False
+  shadows: bool = codec.added(False)
   """The hand throws a shadow on the table, which tells its height."""
 
-  randomize: bool = False
+  randomize: bool = codec.added(False)
   """Every episode has a world of its own, within the ranges of `randomization`."""
 
-  randomization: RandomizationConfig = dataclasses.field(
-    default_factory=RandomizationConfig
-  )
+  randomization: RandomizationConfig = codec.added(RandomizationConfig())
   """Ranges of domain randomisation, in effect with `randomize`."""
 
   @property
@@ -215,25 +216,25 @@ class AgentConfig:
   conv_channels: int = 32
   """Channels of the second convolution of each camera."""
 
-  residual_blocks: int = 0
+  residual_blocks: int = codec.added(0)
   """Residual blocks, two 3x3 convolutions each, after the second convolution of each
   camera; the paper has none. Slow on a CPU."""
 
-  global_features: str = "map"
+  global_features: str = codec.added("map")
   """What is kept of the convolutions of the global camera: map (flattened); keypoints
   (where each channel scores highest), which learn from fewer scenes; or both."""
 
-  wrist_features: str = "map"
+  wrist_features: str = codec.added("map")
   """The same for the camera on the wrist."""
 
   conv_overlap: bool = True
   """Second convolution 3x3 with stride 2; else 2x2 patches, faster but coarser."""
 
-  image_shift: int = 0
+  image_shift: int = codec.added(0)
   """Images of a batch are moved at random by up to so many pixels along each axis; 0:
   they stay as they are."""
 
-  color_jitter: float = 0.0
+  color_jitter: float = codec.added(0.0)
   """Colour channels of the images of a batch are multiplied at random by factors this
   close to 1; 0: they stay as they are."""
 
@@ -296,7 +297,7 @@ class ReplayConfig:
   batch_size: int = 64
   """Transitions per update, both replays together."""
 
-  demonstrations: str = ""
+  demonstrations: str = codec.added("")
   """File of demonstrations to fill the expert replay from, in place of the scripted
   expert; docs/demonstrations.md has the format."""
 
@@ -361,14 +362,20 @@ def config_to_json(config: TrainConfig) -> str:
   return codec.to_json(config)
 
 
-def config_from_json(text: str) -> TrainConfig:
+def config_from_json(
+  text: str, say: Callable[[str], None] = codec.unsaid
+) -> TrainConfig:
   """Reads and validates what ``config_to_json`` wrote; nothing is executed.
+
+  Args:
+    text: the configuration.
+    say: is told in one line which settings came after it was written, if any.
 
   Raises:
     ConfigError: not JSON, a key unknown, missing or of the wrong type, or a
       setting that cannot work.
   """
-  config = codec.from_json(TrainConfig, text)
+  config = codec.from_json(TrainConfig, text, say)
   validate(config)
   return config
 

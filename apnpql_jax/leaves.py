@@ -94,13 +94,21 @@ def to_plain(tree: Any) -> Any:
 
 
 def to_typed(tree: Any, impls: Mapping[str, str], example: Any) -> Any:
-  """Undoes ``to_plain``, given the ``key_impls`` and shapes of the original tree."""
+  """Undoes ``to_plain``, given the ``key_impls`` and shapes of the original tree.
+
+  Raises:
+    ValueError: these are not the generators of the keys.
+    TypeError: these are the names of none.
+  """
 
   def restored(path: Any, like: Any, leaf: jax.Array | None) -> jax.Array:
     if leaf is None:
       return jnp.zeros(like.shape, like.dtype, device=getattr(like, "sharding", None))
-    impl = impls.get(_name(path))
-    return leaf if impl is None else jax.random.wrap_key_data(leaf, impl=impl)
+    if (impl := impls.get(_name(path))) is not None:
+      leaf = jax.random.wrap_key_data(leaf, impl=impl)
+    if leaf.dtype != like.dtype:
+      raise ValueError(f"{_name(path)} is {leaf.dtype}, not {like.dtype}")
+    return leaf
 
   return jax.tree_util.tree_map_with_path(restored, example, tree)
 

@@ -177,7 +177,8 @@ def metric_files(run_dir: Path) -> list[Path]:
 
 def read_evaluations(run_dir: Path) -> list[Row]:
   """Rows of all evaluations of a run, oldest first."""
-  rows = (row for path in metric_files(run_dir) for row in read_rows(path))
+  files, told = metric_files(run_dir), json.dumps(SUCCESS)
+  rows = (row for path in files for row in read_rows(path, having=told))
   return [row for row in rows if row.get(SUCCESS) is not None]
 
 
@@ -185,25 +186,32 @@ def _numbered(path: Path, number: int) -> Path:
   return path.with_suffix(f".{number}{path.suffix}")
 
 
-def read_rows(path: Path) -> list[Row]:
+def read_rows(path: Path, *, having: str = "") -> list[Row]:
   """Rows of a ``metrics.jsonl``, oldest first; none if there is no file.
+
+  Args:
+    path: the file.
+    having: only lines with this text are looked at, one at a time: of a long run few
+      rows are evaluations.
 
   Raises:
     ConfigError: a line is not a row, other than a last one that was cut off.
   """
   if not path.exists():
     return []
-  text = path.read_text(encoding="utf-8", errors="replace")
   rows = []
-  for number, line in enumerate(text.splitlines(keepends=True), start=1):
-    if not line.endswith("\n"):
-      break
-    try:
-      row = json.loads(line)
-      row[STEP] + 0
-    except (ValueError, TypeError, KeyError):
-      raise ConfigError(f"{path}, line {number}: not a row of metrics") from None
-    rows.append(row)
+  with path.open(encoding="utf-8", errors="replace") as file:
+    for number, line in enumerate(file, start=1):
+      if not line.endswith("\n"):
+        break
+      if having not in line:
+        continue
+      try:
+        row = json.loads(line)
+        row[STEP] + 0
+      except (ValueError, TypeError, KeyError):
+        raise ConfigError(f"{path}, line {number}: not a row of metrics") from None
+      rows.append(row)
   return rows
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 import contextlib
+import fcntl
+import os
 from pathlib import Path
 import shutil
 
+from apnpql_jax import codec
 from apnpql_jax.config import (
   ConfigError,
   TrainConfig,
@@ -58,8 +61,14 @@ def new_run_dir(preset: str, root: Path = Path("runs")) -> Path:
   return root / f"{preset}-{number}"
 
 
-def load_run_config(run_dir: Path) -> TrainConfig:
+def load_run_config(
+  run_dir: Path, say: Callable[[str], None] = codec.unsaid
+) -> TrainConfig:
   """The configuration that a run was started with.
+
+  Args:
+    run_dir: the run folder.
+    say: is told in one line which settings came after the run, if any.
 
   Raises:
     ConfigError: not a run folder, or its configuration cannot be read.
@@ -71,7 +80,8 @@ def load_run_config(run_dir: Path) -> TrainConfig:
       f"{_nearby_runs(run_dir)}"
     )
   try:
-    return config_from_json(read_small(path, _MAX_CONFIG_BYTES))
+    text = read_small(path, _MAX_CONFIG_BYTES)
+    return config_from_json(text, lambda line: say(f"{path} is {line}"))
   except ConfigError as error:
     raise ConfigError(f"{path}: {error}") from None
   except (OSError, ValueError) as error:
@@ -109,7 +119,8 @@ def check_resumable(run_dir: Path, wanted: TrainConfig) -> None:
   """Refuses to go on with settings other than those of the checkpoint.
 
   Raises:
-    ConfigError: a setting outside ``MAY_CHANGE`` differs; the message lists each.
+    ConfigError: a setting outside ``MAY_CHANGE`` differs; the message lists each. Or
+      the run is being trained.
   """
   diff = config_diff(load_run_config(run_dir), wanted)
   diff = {name: pair for name, pair in diff.items() if name not in MAY_CHANGE}
@@ -118,13 +129,44 @@ def check_resumable(run_dir: Path, wanted: TrainConfig) -> None:
       f"{str(run_dir)!r} was made with other settings: {format_diff(diff)}; resume "
       f"it without them (only {', '.join(MAY_CHANGE)} may change), or start a new run"
     )
+  _check_idle(run_dir)
+
+
+@contextlib.contextmanager
+def alone(run_dir: Path, *, lock: int = fcntl.LOCK_EX) -> Generator[None, None, None]:
+  """Keeps other processes from training in the folder; a killed one lets go of it.
+
+  Args:
+    run_dir: the run folder.
+    lock: a shared one only looks whether there is somebody.
+
+  Raises:
+    ConfigError: another process trains there.
+  """
+  folder = os.open(run_dir, os.O_RDONLY)
+  try:
+    try:
+      fcntl.flock(folder, lock | fcntl.LOCK_NB)
+    except BlockingIOError:
+      raise ConfigError(f"{str(run_dir)!r} is trained by another process") from None
+    except OSError:  # Not every file system has locks.
+      pass
+    yield
+  finally:
+    os.close(folder)
+
+
+def _check_idle(run_dir: Path) -> None:
+  with alone(run_dir, lock=fcntl.LOCK_SH):
+    pass
 
 
 def check_free(run_dir: Path, *, overwrite: bool) -> None:
   """Refuses a run folder that holds something, unless it is a run to overwrite.
 
   Raises:
-    ConfigError: the folder is in use, or is no run folder and so never removed.
+    ConfigError: the folder is in use, or is no run folder and so never removed, or
+      its run is being trained.
   """
   if not run_dir.exists():
     return
@@ -141,6 +183,7 @@ def check_free(run_dir: Path, *, overwrite: bool) -> None:
       f"{str(run_dir)!r} holds a run; go on with --resume {run_dir}, replace it with "
       "--overwrite, or choose another --run"
     )
+  _check_idle(run_dir)
 
 
 @contextlib.contextmanager

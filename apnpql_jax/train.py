@@ -115,10 +115,11 @@ def _run(
   config: TrainConfig, start: Start, signals: Signals
 ) -> tuple[TrainState, dict[str, Any]]:
   """Opens what is written to, and trains; returns the last evaluation too."""
-  sharding.first_alone(lambda: _set_aside(start))
+  path = start.folder.path
   with (
+    runs.alone(path) if sharding.leads() else contextlib.nullcontext(),
     _reporting(config, start) as reporter,
-    CheckpointWriter(start.folder.path, config, keep=config.keep_checkpoints) as saver,
+    CheckpointWriter(path, config, keep=config.keep_checkpoints) as saver,
   ):
     iteration: Any = make_iteration(config, start.env, start.agent)
     if start.env.mesh is not None:
@@ -135,6 +136,7 @@ def _reporting(
   config: TrainConfig, start: Start
 ) -> Generator[Reporter | Silent, None, None]:
   """Opens the metrics and the progress; of several processes, the first one tells."""
+  sharding.first_alone(lambda: _set_aside(start))
   if not sharding.leads():
     yield Silent(start.folder)
     return
@@ -208,8 +210,9 @@ def _loop(config, iteration, state, reporter, saver, signals) -> TrainState:
     before = step
     state, metrics = iteration(state)
     step = int(state.env_steps)
-    reporter.iteration(step, int(state.learner.step), metrics | saver.finished())
+    # Before it is told that an iteration is done, for then there is something to save.
     signals.finish_first(f"stopped at once; to go on: --resume {reporter.folder.path}")
+    reporter.iteration(step, int(state.learner.step), metrics | saver.finished())
     faults.check(config, state, reporter.folder)
     done = step >= config.total_steps
     rate = None

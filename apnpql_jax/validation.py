@@ -100,9 +100,11 @@ def validate(
     check_name("agent.algorithm", config.agent.algorithm, tuple(algorithms))
   _validate_env(config.env)
   _validate_agent(config.agent)
+  _validate_returns(config.agent)
   limited = config.agent.temperature != "fixed"
   if limited and algorithms is not None and algorithms[config.agent.algorithm]:
     _validate_epsilon(config.agent)
+  _validate_expert(config)
   _validate_replay(config, None if memory_bytes is None else memory_bytes * devices)
   for name, number in (
     ("env.worlds", config.env.worlds),
@@ -191,10 +193,6 @@ def _validate_agent(agent: AgentConfig) -> None:
     )
   if not 0.0 <= agent.color_jitter <= 1.0:
     raise ConfigError(f"agent.color_jitter={agent.color_jitter} must be within [0, 1]")
-  if agent.v_min >= agent.v_max:
-    raise ConfigError(
-      f"agent.v_min={agent.v_min} must be below agent.v_max={agent.v_max}"
-    )
   if not agent.hidden or min(agent.hidden) < 1 or max(agent.hidden) >= 2**31:
     raise ConfigError(f"agent.hidden={agent.hidden} must be positive layer widths")
   for kind in ("", "policy_"):
@@ -211,6 +209,13 @@ def _validate_agent(agent: AgentConfig) -> None:
   if not 0.0 < agent.policy_min_prob < 0.5:
     raise ConfigError(
       f"agent.policy_min_prob={agent.policy_min_prob} must be within (0, 1/2)"
+    )
+
+
+def _validate_returns(agent: AgentConfig) -> None:
+  if agent.v_min >= agent.v_max:
+    raise ConfigError(
+      f"agent.v_min={agent.v_min} must be below agent.v_max={agent.v_max}"
     )
   if not agent.v_min < agent.initial_value < agent.v_max:
     raise ConfigError(
@@ -231,8 +236,8 @@ def _validate_epsilon(agent: AgentConfig) -> None:
     )
 
 
-def _validate_replay(config: TrainConfig, memory_bytes: int | None) -> None:
-  replay, per_iteration = config.replay, config.env.worlds * config.rollout_length
+def _validate_expert(config: TrainConfig) -> None:
+  replay = config.replay
   if not 0.0 <= replay.expert_share <= 1.0:
     raise ConfigError(
       f"replay.expert_share={replay.expert_share} must be within [0, 1]"
@@ -263,6 +268,10 @@ def _validate_replay(config: TrainConfig, memory_bytes: int | None) -> None:
       f"replay.demonstrations={replay.demonstrations} cannot be used with "
       "env.randomize: they show the world of the scene file"
     )
+
+
+def _validate_replay(config: TrainConfig, memory_bytes: int | None) -> None:
+  replay, per_iteration = config.replay, config.env.worlds * config.rollout_length
   if replay.capacity % per_iteration:
     raise ConfigError(
       f"replay.capacity={replay.capacity} must be a multiple of env.worlds * "

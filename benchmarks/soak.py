@@ -3,10 +3,11 @@
   python benchmarks/soak.py --minutes 60      # two cores; any machine without a GPU
 
 Two runs of one seed train side by side. One is left alone, and its memory is measured;
-the other meets a fault every few seconds and is resumed. At the end both are brought to
-the same step, where all their arrays and metrics must be the same bits. Worlds and
-rewards that are not finite are put into checkpoints of copies of the disturbed run.
-Writes results/soak.json and results/soak.log beside this file.
+the other meets a fault every few seconds and is resumed. At the end a third one trains
+straight to where the disturbed one is: all their arrays must be the same bits, and the
+metrics of all three the same figures. Worlds and rewards that are not finite are put
+into checkpoints of copies of the disturbed run. Writes results/soak.json and
+results/soak.log beside this file.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ INTERVAL = 512
 """Environment steps between two checkpoints."""
 
 OPTIONS = (
-  f"--replay.capacity 4096 --replay.expert-steps 512 --checkpoint-every {INTERVAL}"
+  f"--replay.capacity 4096 --replay.expert-steps 512 --checkpoint-every {INTERVAL} "
+  f"--eval-every {64 * INTERVAL}"
 )
 FOR_EVER = ["--total-steps", "2000000000"]
 PATIENCE_S = 600
@@ -84,7 +86,7 @@ class Trial:
       shutil.rmtree(target)
     return row
 
-  def _end(self, process: Process, fault: str) -> int:
+  def _end(self, process: Process, fault: str) -> int | None:
     pause = self._rng.uniform(0.0, 8.0)
     if fault == "kill in a save":
       self._until(lambda: any((self.run / "checkpoints").glob("*tmp*")), process)
@@ -97,7 +99,11 @@ class Trial:
       polite = {"SIGINT": signal.SIGINT, "SIGTERM": signal.SIGTERM}
       polite["poisoned world"] = signal.SIGTERM
       process.send_signal(polite.get(fault, signal.SIGKILL))
-    return process.wait(PATIENCE_S)
+    return ended(process)
+
+  def said(self) -> str:
+    """The end of what the last process said."""
+    return self._said.read_text(errors="replace")[-2000:]
 
   def wait(self, process: Process) -> None:
     """Until the process just started has done an iteration, or has ended."""
@@ -107,8 +113,18 @@ class Trial:
     deadline = time.monotonic() + PATIENCE_S
     while not happens() and process.poll() is None:
       if time.monotonic() > deadline:
-        raise TimeoutError(self._said.read_text()[-2000:])
+        raise TimeoutError(self.said())
       time.sleep(0.005)
+
+
+def ended(process: Process, patience_s: float = PATIENCE_S) -> int | None:
+  """Exit code of a process that is to end; None if it hangs, and is killed."""
+  try:
+    return process.wait(patience_s)
+  except subprocess.TimeoutExpired:
+    process.kill()
+    process.wait()
+    return None
 
 
 EXPECTED = {
@@ -129,7 +145,7 @@ def as_expected(row: dict[str, Any]) -> bool:
   fault = row["fault"]
   if fault == "poisoned world" and row["faults/worlds"] != 1:
     return False
-  if fault == "poisoned rewards" and "batch" not in row["repeated"]:
+  if fault == "poisoned rewards" and "reward_t" not in row.get("repeated", ""):
     return False
   # What is trained while a checkpoint is being written is lost with it.
   return row["exit"] == EXPECTED[fault] and row.get("lost", 0) <= 2 * INTERVAL
@@ -168,9 +184,31 @@ class Memory:
     return {"minutes_mib": minutes, "slope_mib_per_h": round(float(slope), 1)}
 
 
-def losses(run: Path) -> list[tuple[int, float]]:
-  """Step and loss of every iteration in the metrics, in their order."""
-  return [(row["step"], row["loss/q"]) for row in tiny.rows(run) if "loss/q" in row]
+def same_bits(trials: list[Trial], total: int, patience_s: float) -> bool:
+  """Whether all runs, trained to the step ``total``, hold the same arrays there."""
+  processes = [trial.start(trial.run, "--total-steps", str(total)) for trial in trials]
+  if [ended(process, patience_s) for process in processes] != [0] * len(trials):
+    print("\n".join(trial.said() for trial in trials), file=sys.stderr)
+    return False
+  first, *others = (tiny.saved_bytes(trial.run, total) for trial in trials)
+  return all(bits == first for bits in others)
+
+
+def same_metrics(*runs: Path) -> bool:
+  """Whether each iteration stands once in the metrics of each run, with one loss.
+
+  Runs may differ in length; they are compared as far as the shortest goes.
+  """
+  losses = [
+    [(row["step"], row["loss/q"]) for row in tiny.rows(run) if "loss/q" in row]
+    for run in runs
+  ]
+  whole = all(
+    step == number * tiny.STEPS
+    for run in losses
+    for number, (step, _) in enumerate(run, start=1)
+  )
+  return whole and all(len(set(rows)) == 1 for rows in zip(*losses, strict=False))
 
 
 def main() -> int:
@@ -191,43 +229,36 @@ def main() -> int:
 def soak(
   folder: Path, minutes: float, rng: random.Random
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-  """Both runs to their end: a summary, and what happened in its order."""
-  alone, disturbed = (Trial(folder / name, rng) for name in ("alone", "disturbed"))
-  trials, events = (alone, disturbed), []
-  straight = alone.start(alone.run)
-  alone.wait(straight)  # What it compiles, the other takes from the cache.
-  memory, began = Memory(straight), time.monotonic()
+  """All runs to their end: a summary, and what happened in its order."""
+  names = ("alone", "disturbed", "straight")
+  alone, disturbed, straight = (Trial(folder / name, rng) for name in names)
+  events: list[dict[str, Any]] = []
+  process = alone.start(alone.run)
+  alone.wait(process)  # What it compiles, the others take from the cache.
+  memory, began = Memory(process), time.monotonic()
   try:
     while (passed := (time.monotonic() - began) / 60) < minutes:
       event = disturbed.disturb(list(EXPECTED)[len(events) % len(EXPECTED)])
       event = {"minute": round(passed, 1), "as_promised": as_expected(event)} | event
+      event |= {} if event["as_promised"] else {"said": disturbed.said()}
       events.append(event)
       print(json.dumps(event), flush=True)
   finally:
-    straight.terminate()
-  stopped = straight.wait(PATIENCE_S) == EXPECTED["SIGTERM"]
-  total = max(reached(trial.run) for trial in trials) + tiny.STEPS
-  codes = [
-    trial.start(trial.run, "--total-steps", str(total)).wait(PATIENCE_S * 6)
-    for trial in trials
-  ]
-  bits = (
-    [tiny.saved_bytes(trial.run, total) for trial in trials] if codes == [0, 0] else []
-  )
-  figures = losses(alone.run)
-  whole = [step for step, _ in figures] == list(
-    range(tiny.STEPS, total + 1, tiny.STEPS)
-  )
+    process.terminate()
+  stopped = ended(process) == EXPECTED["SIGTERM"]
+  total = reached(disturbed.run) + tiny.STEPS
+  # The disturbed run has taken the time of the soak to come here.
+  patience_s = PATIENCE_S + 60 * minutes
   result = {
-    "minutes": round((time.monotonic() - began) / 60, 1),
+    "minutes": round(passed, 1),
     "cores": len(os.sched_getaffinity(0)),
-    "env_steps": total,
+    "env_steps": {"alone": reached(alone.run), "disturbed": total},
     "faults": collections.Counter(event["fault"] for event in events),
     "most_steps_lost": max((event.get("lost", 0) for event in events), default=0),
     "checkpoint_every": INTERVAL,
     "memory": memory.summary(),
-    "same_bits": bool(bits) and bits[0] == bits[1],
-    "metrics_consistent": whole and figures == losses(disturbed.run),
+    "same_bits": same_bits([disturbed, straight], total, patience_s),
+    "metrics_consistent": same_metrics(straight.run, disturbed.run, alone.run),
   }
   kept = stopped and result["same_bits"] and result["metrics_consistent"]
   kept = kept and all(event["as_promised"] for event in events)

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from apnpql_jax import demonstrations
+from apnpql_jax import demonstrations, metrics
 from apnpql_jax.config import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
 from apnpql_jax.primitives.bank import load_bank
 from apnpql_jax.tasks import make_task
@@ -64,7 +64,11 @@ PRESET_ARGS = (  # The same on the command line, on top of push_plate's preset.
 
 
 def start(
-  run_dir: Path, *args: str, said: Path, log_compiles: bool = False
+  run_dir: Path,
+  *args: str,
+  said: Path,
+  log_compiles: bool = False,
+  xla_flags: str = XLA_FLAGS,
 ) -> subprocess.Popen[bytes]:
   """Trains in a new process, or goes on if ``run_dir`` is a run; stderr to ``said``."""
   command = [sys.executable, "-m", "apnpql_jax", "train"]
@@ -72,7 +76,7 @@ def start(
     command += ["--resume", str(run_dir)]
   else:
     command += ["push_plate", "--run", str(run_dir), *PRESET_ARGS]
-  env = os.environ | {"XLA_FLAGS": XLA_FLAGS, "PYTHONPATH": str(ROOT)}
+  env = os.environ | {"XLA_FLAGS": xla_flags, "PYTHONPATH": str(ROOT)}
   env |= {"JAX_LOG_COMPILES": "1"} if log_compiles else {}
   with said.open("ab") as file:
     return subprocess.Popen(
@@ -101,17 +105,22 @@ def write_demonstrations(path: Path) -> None:
 
 def rows(run_dir: Path) -> list[dict[str, Any]]:
   """Whole rows of the metrics of a run; none if it has not begun."""
-  path = run_dir / "metrics.jsonl"
-  lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+  files = [path for path in metrics.metric_files(run_dir) if path.exists()]
+  lines = [line for path in files for line in path.read_text().splitlines(True)]
   return [json.loads(line) for line in lines if line.endswith("\n")]
 
 
-def saved_bytes(run_dir: Path, step: int) -> dict[str, bytes]:
+def saved_arrays(run_dir: Path, step: int) -> dict[str, np.ndarray]:
   """Every array of a checkpoint, read by Orbax alone."""
   found = {}
   for item in ("learner", "rest", "replay"):
     with ocp.StandardCheckpointer() as reader:
       tree = reader.restore((run_dir / "checkpoints" / str(step) / item).absolute())
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-      found[f"{item} {path}"] = np.asarray(leaf).tobytes()
+      found[f"{item} {path}"] = np.asarray(leaf)
   return found
+
+
+def saved_bytes(run_dir: Path, step: int) -> dict[str, bytes]:
+  """The bits of ``saved_arrays``."""
+  return {name: x.tobytes() for name, x in saved_arrays(run_dir, step).items()}

@@ -13,12 +13,17 @@ from typing import Any
 import floor
 import jax
 import jax.numpy as jnp
+import numpy as np
 import parts
 import pytest
 import report
+import resume
+import soak
 import tables
 import timing
 import tiny
+
+from apnpql_jax.metrics import MetricWriter
 
 PEAK = {"flops_per_s": 2e9, "bytes_per_s": 1e9}
 MACHINE = {
@@ -133,6 +138,33 @@ def test_shares_add_up_even_if_parts_are_slower_alone():
   assert parts.shares(4.0, {"a": 1.0, "b": 2.0}) == {"a": 0.25, "b": 0.5, "rest": 0.25}
   shares = parts.shares(2.0, {"a": 1.0, "b": 3.0})
   assert shares == {"a": 0.25, "b": 0.75, "rest": 0.0}
+
+
+def test_the_soak_sees_metrics_that_were_put_aside_and_every_other_loss(tmp_path):
+  losses = np.linspace(1.0, 0.1, 40)
+  runs = {"long": losses, "short": losses[:30], "gap": losses[1:], "other": losses + 1}
+  for name, values in runs.items():
+    (tmp_path / name).mkdir()
+    with MetricWriter(tmp_path / name, max_bytes=500) as writer:
+      for i, loss in enumerate(values, start=1 if name != "gap" else 2):
+        writer.write(i * tiny.STEPS, {"loss/q": loss})
+        writer.write(i * tiny.STEPS, {"checkpoint/mib": 1.0})
+  assert (tmp_path / "long" / "metrics.3.jsonl").exists()
+  assert soak.reached(tmp_path / "short") == 30 * tiny.STEPS
+  long, short, gap, other = (tmp_path / name for name in runs)
+  assert soak.same_metrics(long, short)
+  assert not soak.same_metrics(long, gap) and not soak.same_metrics(gap, gap)
+  assert not soak.same_metrics(short, other)
+
+
+def test_what_differs_after_a_resume_is_told_by_how_much():
+  a = {"x": np.array([1.0, -4.0], np.float32), "n": np.arange(3), "k": np.zeros(2)}
+  assert resume.compare(a, a) == {"arrays": 3, "same_bits": 3, "differ": {}}
+  b = a | {"x": np.array([1.0, -3.0], np.float32), "k": np.array([0.0, -0.0])}
+  told = resume.compare(a, b)
+  assert told == {"arrays": 3, "same_bits": 1, "differ": {"x": 0.25, "k": 0.0}}
+  with pytest.raises(ValueError, match="only one state has .*'n'"):
+    resume.compare(a, {"x": a["x"], "k": a["k"]})
 
 
 def test_the_document_is_made_of_what_is_at_hand(tmp_path):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import dataclasses
 import gc
+import json
 from pathlib import Path
 import resource
 import shutil
@@ -13,6 +15,7 @@ import time
 from typing import Any
 
 from flax import struct
+from hypothesis import given, settings, strategies as st
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +24,7 @@ import pytest
 
 from apnpql_jax import checkpoint, checkpoint_record, resuming
 from apnpql_jax.checkpoint_writer import CheckpointWriter, SaveError
-from apnpql_jax.config import AgentConfig, ConfigError, TrainConfig
+from apnpql_jax.config import AgentConfig, ConfigError, TrainConfig, config_to_json
 
 CONFIG = TrainConfig()
 
@@ -169,6 +172,30 @@ def test_other_settings_are_refused_by_name(tmp_path: Path):
   _restore(tmp_path, 1, _state(), config=longer)
 
 
+def test_a_checkpoint_from_before_a_setting_is_read_as_it_was(
+  tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+  def as_then(*lacking: str) -> Callable[[TrainConfig], str]:
+    def to_json(config: TrainConfig) -> str:
+      data = json.loads(config_to_json(config))
+      kept = {k: v for k, v in data["agent"].items() if k not in lacking}
+      return json.dumps(data | {"agent": kept})
+
+    return to_json
+
+  monkeypatch.setattr(checkpoint_record, "config_to_json", as_then("residual_blocks"))
+  _save(tmp_path, (1, _state(1), None))
+  _assert_same_bits(_restore(tmp_path, 1, _state(), config=CONFIG), _state(1))
+  deeper = dataclasses.replace(CONFIG, agent=AgentConfig(residual_blocks=2))
+  with pytest.raises(ConfigError, match="agent.residual_blocks 0 -> 2"):
+    _restore(tmp_path, 1, _state(), config=deeper)
+  # A setting that was always there cannot be missing.
+  monkeypatch.setattr(checkpoint_record, "config_to_json", as_then("gamma"))
+  _save(tmp_path, (2, _state(2), None))
+  with pytest.raises(ConfigError, match="checkpoint 2 of .*'agent.gamma' is missing"):
+    _restore(tmp_path, None, _state(), config=CONFIG)
+
+
 def test_other_leaves_are_refused_by_name(tmp_path: Path):
   state = _state()
   _save(tmp_path, (1, state, None))
@@ -262,6 +289,45 @@ def test_damage_is_recognised_named_and_the_one_before_taken(tmp_path: Path, dam
     shutil.rmtree(run)
   assert refused == {"meta", "state"}
   gc.collect()  # What Orbax left would complain in another test.
+
+
+VALUE = st.integers() | st.floats() | st.booleans() | st.none() | st.text()
+DEEPER = st.sampled_from([True, True, True, False])
+
+
+@pytest.fixture(scope="module")
+def foreign(tmp_path_factory) -> Path:
+  """A run to whose record somebody else has the pen."""
+  run = tmp_path_factory.mktemp("foreign")
+  _save(run, (1, _state(1), 0.5))
+  return run
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.data())
+def test_a_record_that_somebody_wrote_is_refused_in_one_line_or_right(foreign, data):
+  """One value of it in place of another, with a checksum that fits."""
+  path = foreign / "checkpoints" / "1" / "meta" / "metadata"
+  whole = path.read_text()
+  record = json.loads(whole)
+  del record["crc32"]
+  inside, key = record, data.draw(st.sampled_from(sorted(record)))
+  while isinstance(inside[key], dict | list) and inside[key] and data.draw(DEEPER):
+    inside = inside[key]
+    keys = sorted(inside) if isinstance(inside, dict) else range(len(inside))
+    key = data.draw(st.sampled_from(keys))
+  inside[key] = data.draw(VALUE | st.lists(VALUE) | st.just({}))
+  record["crc32"] = checkpoint_record._checksum(record)
+  path.write_text(json.dumps(record))
+  try:
+    found = checkpoint.restore(foreign, None, {"state": _state()}, config=CONFIG)
+  except ConfigError as error:
+    assert len(str(error)) < 2000
+  else:
+    _assert_same_bits(found.items["state"], _state(1))
+    checkpoint.best_step(foreign)
+  finally:
+    path.write_text(whole)
 
 
 def test_without_a_whole_checkpoint_each_is_named(tmp_path: Path):

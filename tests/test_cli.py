@@ -120,6 +120,18 @@ def test_bad_input_ends_with_one_clear_line(line, words, run_dir, tmp_path):
   assert snapshot(tmp_path) == before
 
 
+def test_a_run_from_before_a_setting_is_taken_as_it_was(run_dir, tmp_path):
+  data = json.loads((run_dir / "config.json").read_text())
+  del data["agent"]["residual_blocks"]
+  (run_dir / "config.json").write_text(json.dumps(data))
+  for command in ("evaluate runs/old", "train --resume runs/old --seed 9"):
+    done = apnpql(*command.split(), cwd=tmp_path)
+    assert done.returncode == 2
+    told, refused = done.stderr.splitlines()
+    assert told.endswith("which are as before: agent.residual_blocks 0")
+    assert "no checkpoint" in refused or "seed 0 -> 9" in refused
+
+
 def test_bad_input_with_json_leaves_standard_output_empty(tmp_path):
   done = apnpql("collect", "juggle", "--json", cwd=tmp_path)
   assert (done.returncode, done.stdout) == (2, "")

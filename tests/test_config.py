@@ -11,7 +11,7 @@ import math
 from hypothesis import given, settings, strategies as st
 import pytest
 
-from apnpql_jax import config as config_module, presets
+from apnpql_jax import codec, config as config_module, presets
 from apnpql_jax.config import (
   AgentConfig,
   ConfigError,
@@ -28,6 +28,22 @@ from apnpql_jax.config import (
 )
 
 POSITIVE = st.floats(1e-6, 1e6, allow_nan=False)
+
+LATER = {
+  "env.global_size": (72, 96),
+  "env.wrist_size": (36, 64),
+  "env.shadows": False,
+  "env.randomize": False,
+  "env.randomization": RandomizationConfig(),
+  "agent.residual_blocks": 0,
+  "agent.global_features": "map",
+  "agent.wrist_features": "map",
+  "agent.image_shift": 0,
+  "agent.color_jitter": 0.0,
+  "replay.demonstrations": "",
+}
+"""What runs did before these settings came. No value may ever change here: if a default
+does, ``codec.added`` has to be given both."""
 
 
 def changed(path: str, value: object) -> TrainConfig:
@@ -235,6 +251,29 @@ def test_json_is_read_strictly(text, words):
     config_from_json(text)
   for word in words:
     assert word in str(error.value)
+
+
+def test_a_setting_that_came_later_is_as_before_where_it_is_missing():
+  for path, before in LATER.items():
+    said: list[str] = []
+    config = config_from_json(edited(path, ...), said.append)
+    assert config == replaced(TrainConfig(), path.split("."), before)
+    (line,) = said
+    assert line.count(path) == 1 and "\n" not in line
+  data = json.loads(config_to_json(TrainConfig()))
+  old = {k: v for k, v in data["agent"].items() if f"agent.{k}" not in LATER}
+  said = []
+  assert config_from_json(json.dumps(data | {"agent": old}), said.append)
+  assert said[0].endswith("agent.image_shift 0, agent.color_jitter 0.0")
+  assert config_from_json(config_to_json(TrainConfig()), pytest.fail)
+
+
+def test_any_other_setting_that_is_missing_is_refused_by_name():
+  paths = [name for name, _ in codec.flatten(TrainConfig())] + ["env", "agent"]
+  for path in paths:
+    if path not in LATER:
+      with pytest.raises(ConfigError, match=f"'{path}' is missing"):
+        config_from_json(edited(path, ...), pytest.fail)
 
 
 def test_diff_names_exactly_what_differs():

@@ -14,7 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 import tiny
 
-from apnpql_jax import demonstrations, recordings
+from apnpql_jax import cli, demonstrations, recordings
 from apnpql_jax.config import ConfigError
 from apnpql_jax.demonstrations import Demonstrations
 from apnpql_jax.env import Env, make_env
@@ -23,6 +23,11 @@ from apnpql_jax.sim.physics import START_TIME, Physics, PhysicsState
 ENV = dataclasses.replace(tiny.CONFIG.env, time_limit_s=0.9)
 CONFIG = dataclasses.replace(tiny.CONFIG, env=ENV)
 EPISODES, STEPS = 6, 6
+FUZZ = settings(
+  max_examples=150,
+  deadline=None,
+  suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
 
 
 @pytest.fixture(scope="module")
@@ -159,11 +164,7 @@ def test_other_files_are_refused_by_name(path, demos, env):
     demonstrations.load(path.with_name("none"), env)
 
 
-@settings(
-  max_examples=150,
-  deadline=None,
-  suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
+@FUZZ
 @given(
   st.sampled_from(sorted({*Demonstrations._fields, "format", "version", "task"})),
   st.one_of(
@@ -250,3 +251,43 @@ def test_what_a_recording_cannot_tell_is_asked_for(tmp_path, demos, env):
   refused("unknown arrays .'camera'", camera=np.zeros(3))
   refused("gripper is not finite", gripper=whole["gripper"] * np.nan)
   refused("time must be numbers", time=None)
+  refused("time must be numbers", time=np.float64(0.0))
+  refused("quaternion of plate is not of unit", plate=0 * whole["plate"])
+  refused("variant must be one whole number", variant=np.zeros(2, int))
+  refused("variant is none of the scene's", variant=np.int64(2**40))
+  # Two instants a year apart ask for no memory.
+  refused("500 s lie between two samples", time=1e4 * whole["time"])
+
+
+@FUZZ
+@given(
+  st.sampled_from("time joints gripper plate goal episode variant".split()),
+  st.one_of(
+    st.integers(-(2**62), 2**62), st.floats(), st.text(max_size=5), st.booleans()
+  ),
+  st.one_of(st.none(), st.lists(st.integers(0, 5), max_size=3)),
+)
+def test_a_recording_is_refused_in_one_line_or_becomes_demonstrations(
+  tmp_path, demos, env, name, value, shape
+):
+  """One array in place of another, or one number in place of another."""
+  whole, path = _recording(env, demos), tmp_path / "recording.npz"
+  if shape is None and name != "variant" and not isinstance(value, str):
+    whole[name] = np.asarray(whole[name], np.float64)
+    whole[name].flat[7] = value
+  else:
+    whole[name] = np.full(shape or (), value)
+  np.savez(path, **whole)
+  try:
+    made = recordings.convert(path, env.task.scene, period_s=0.15)
+  except ConfigError as error:
+    assert "\n" not in str(error) and str(path) in str(error)
+  else:
+    demonstrations.check(made, env.task.scene)
+
+
+def test_the_command_converts_a_recording(tmp_path, demos, env):
+  recording, out = tmp_path / "recording.npz", tmp_path / "mine.npz"
+  np.savez(recording, **_recording(env, demos))
+  assert cli.main(["convert", str(recording), "push_plate", str(out)]) == 0
+  assert demonstrations.load(out, env).instants == demos.instants

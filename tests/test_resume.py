@@ -6,9 +6,11 @@ promises. What they found is in ``docs/reliability.md``.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 import signal
 import subprocess
+import sys
 import time
 
 import numpy as np
@@ -46,7 +48,7 @@ def test_a_run_killed_at_random_moments_ends_as_if_nothing_had_been(tmp_path, ki
   process = tiny.start(run, *FOR_EVER, "--replay.demonstrations", str(demos), said=said)
   _wait(process, said, "compiling")
   process.send_signal(signal.SIGINT)
-  assert process.wait(5) == 128 + signal.SIGINT
+  assert process.wait(30) == 128 + signal.SIGINT
   *_, told, last = said.read_text().splitlines()
   assert "compiling" in told and last.startswith("apnpql: stopped before the first")
   assert f"16 instants of {demos} for 32 slots" in said.read_text()
@@ -100,3 +102,16 @@ def test_a_run_killed_at_random_moments_ends_as_if_nothing_had_been(tmp_path, ki
   assert log.read_text().count("compilation of jit(iteration)") == 1
   assert "compilation cache hit for 'jit_iteration'" in log.read_text()
   assert 0 < compiled < 8 < len(losses[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+  ("backend", "obs"), [("mjx", "state"), ("native", "pixels"), ("mjx", "pixels")]
+)
+def test_a_run_resumed_in_a_new_process_is_the_run_that_was_not(backend, obs):
+  """For other engines and observations, compiled as any run is."""
+  command = [sys.executable, str(tiny.ROOT / "benchmarks" / "resume.py")]
+  command += ["--backend", backend, "--obs", obs]
+  env = os.environ | {"PYTHONPATH": str(tiny.ROOT)}
+  done = subprocess.run(command, env=env, capture_output=True, text=True)
+  assert done.returncode == 0, done.stdout + done.stderr

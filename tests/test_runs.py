@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
+import subprocess
+import sys
 
 import pytest
 
 from apnpql_jax import runs
 from apnpql_jax.config import AgentConfig, ConfigError, TrainConfig, config_to_json
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def write_run(folder: Path, config: TrainConfig | None = None) -> Path:
@@ -30,6 +35,29 @@ def test_configuration_of_a_run_is_read_back(tmp_path):
   assert runs.load_run_config(write_run(tmp_path / "a", config)) == config
 
 
+def test_a_run_made_before_a_setting_came_is_read_and_that_is_said(tmp_path):
+  config = TrainConfig(seed=3, agent=AgentConfig(gamma=0.9))
+  run = write_run(tmp_path / "a", config)
+  data = json.loads((run / "config.json").read_text())
+  del data["agent"]["residual_blocks"]
+  (run / "config.json").write_text(json.dumps(data))
+  said: list[str] = []
+  assert runs.load_run_config(run, said.append) == config
+  assert said == [
+    f"{run}/config.json is older than some settings, which are as before: "
+    "agent.residual_blocks 0"
+  ]
+  # It is resumed as it was, and only so.
+  runs.check_resumable(run, config)
+  blocks = dataclasses.replace(config.agent, residual_blocks=1)
+  with pytest.raises(ConfigError, match="agent.residual_blocks 0 -> 1"):
+    runs.check_resumable(run, dataclasses.replace(config, agent=blocks))
+  del data["agent"]["n_step"]
+  (run / "config.json").write_text(json.dumps(data))
+  with pytest.raises(ConfigError, match="config.json: .*'agent.n_step' is missing"):
+    runs.load_run_config(run, pytest.fail)
+
+
 def test_configuration_that_is_not_text_is_refused(tmp_path):
   write_run(tmp_path / "a")
   (tmp_path / "a" / "config.json").write_bytes(b"\xff\xfe\x00")
@@ -49,6 +77,33 @@ def test_resume_may_change_only_what_does_not_alter_learning(tmp_path):
     changed = {name: getattr(TrainConfig(), name) + 1}
     with pytest.raises(ConfigError, match=name):
       runs.check_resumable(run, dataclasses.replace(TrainConfig(), **changed))
+
+
+def test_a_run_that_is_trained_is_left_alone(tmp_path):
+  run, other = write_run(tmp_path / "run"), write_run(tmp_path / "other")
+  with runs.alone(run), runs.alone(other):
+    for refused in (
+      lambda: runs.check_resumable(run, TrainConfig()),
+      lambda: runs.check_free(run, overwrite=True),
+      lambda: runs.alone(run).__enter__(),
+    ):
+      with pytest.raises(ConfigError, match="run' is trained by another process"):
+        refused()
+    runs.load_run_config(run)
+  runs.check_resumable(run, TrainConfig())
+  runs.check_free(run, overwrite=True)
+  # A process that is killed lets go of it.
+  code = "import sys, pathlib, time; from apnpql_jax import runs\n"
+  code += (
+    "with runs.alone(pathlib.Path(sys.argv[1])): print(flush=True); time.sleep(60)"
+  )
+  command = [sys.executable, "-c", code, str(run)]
+  with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as process:
+    assert process.stdout is not None and process.stdout.readline()
+    with pytest.raises(ConfigError, match="another process"):
+      runs.check_free(run, overwrite=True)
+    process.kill()
+  runs.check_free(run, overwrite=True)
 
 
 def test_only_a_run_can_be_overwritten(tmp_path):
