@@ -11,6 +11,7 @@ beside this file, in place of what was there for the same task, engine and setti
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 from pathlib import Path
 
@@ -55,8 +56,14 @@ def measure(
   task = make_task(name)
   config = EnvConfig(task=name, backend=backend, obs="state")
   bank, _ = load_bank(task, config.bank_rows)  # As shipped: the same resets for all.
-  task.scene.model.opt.iterations = iterations
-  task.scene.model.opt.ls_iterations = ls_iterations
+  model = task.scene.model
+  model.opt.iterations = iterations
+  model.opt.ls_iterations = ls_iterations
+  model.numeric("mjx_ls_iterations").data[:] = ls_iterations
+  # Otherwise C MuJoCo would be called as it was first set up for this scene.
+  task.scene = dataclasses.replace(
+    task.scene, fingerprint=f"{iterations}x{ls_iterations}"
+  )
   env = Env(config, task, bank)
   play = make_player(env, lambda _: expert_policy(env, noise=0.0))
   figures = play_held_out(env, play, None, episodes=episodes, seed=0)

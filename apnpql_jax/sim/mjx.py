@@ -31,7 +31,10 @@ class MjxPhysics:
     joints = scene.model.jnt_type[scene.model.dof_jntid]
     self._free = joints == mujoco.mjtJoint.mjJNT_FREE
     device = jax.local_devices()[0]  # MJX would take the first one of all processes.
-    self._model = mjx.put_model(scene.model, device, impl="jax")
+    line_search = int(scene.model.numeric("mjx_ls_iterations").data[0])
+    self._model = mjx.put_model(scene.model, device, impl="jax").tree_replace(
+      {"opt.ls_iterations": line_search}
+    )
     self._template = mjx.make_data(scene.model, device, impl="jax")
     self._torque_limit = jnp.asarray(scene.model.actuator_ctrlrange[:6, 1], jnp.float32)
 
