@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import json
+import logging
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -168,6 +169,8 @@ def _restore_item(run_dir: Path, step: int, item: str, example: Any) -> Any:
   except (MemoryError, PermissionError):
     raise  # No fault of the checkpoint's.
   except Exception as error:  # Whatever Orbax or the file system found wrong.
+    # Pages of it would come from each of its tasks for which nobody waits any more.
+    logging.getLogger("asyncio").setLevel(logging.CRITICAL)
     raise DamagedError(f"{name} cannot be read: {first_line(error)}") from error
   checkpoint_record.check_bits(name, saved, tree)
   impls = {path: leaf.key_impl for path, leaf in saved.items() if leaf.key_impl}

@@ -251,10 +251,10 @@ def test_what_a_recording_cannot_tell_is_asked_for(tmp_path, demos, env):
   refused("unknown arrays .'camera'", camera=np.zeros(3))
   refused("gripper is not finite", gripper=whole["gripper"] * np.nan)
   refused("time must be numbers", time=None)
-  refused("time must be numbers", time=np.float64(0.0))
+  refused("time must be numbers", time=np.array(0.0))
   refused("quaternion of plate is not of unit", plate=0 * whole["plate"])
   refused("variant must be one whole number", variant=np.zeros(2, int))
-  refused("variant is none of the scene's", variant=np.int64(2**40))
+  refused("variant is none of the scene's", variant=np.array(2**40))
   # Two instants a year apart ask for no memory.
   refused("500 s lie between two samples", time=1e4 * whole["time"])
 
