@@ -32,6 +32,8 @@ RESULTS = tables.RESULTS / "tasks"
 DOC = tables.ROOT / "docs" / "tasks.md"
 INSTANTS = 4
 """Instants of an episode in a picture."""
+MARGIN = 6
+"""White pixels around each."""
 EXPERTS_HEAD = (
   "task",
   "backend",
@@ -104,7 +106,9 @@ def show(env: Env) -> None:
   record_episodes(env, policy, folder / f"{env.task.name}.mp4")
   episode = film(env, policy)[0]
   chosen = np.linspace(0, len(episode) - 1, INSTANTS).round().astype(int)
-  rows = [np.concatenate(list(episode[pair]), axis=1) for pair in chosen.reshape(2, -1)]
+  around = (0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN), (0, 0)
+  framed = np.pad(episode[chosen], around, constant_values=255)
+  rows = [np.concatenate(list(pair), axis=1) for pair in np.split(framed, 2)]
   iio.imwrite(folder / f"{env.task.name}.png", np.concatenate(rows))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import os
 
+from hand_made import WORLDS, drawn, neutral_tool
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,18 +13,18 @@ import pytest
 
 import apnpql_jax  # noqa: F401  (sets threads and the compilation cache)
 from apnpql_jax.sim import physics
+from apnpql_jax.sim.kinematics import Kinematics, make_kinematics
 from apnpql_jax.tasks import Task, make_task
+from apnpql_jax.tasks.task import ResetDraw
 
 # Figures are written to files; no test may need a display.
 os.environ.setdefault("MPLBACKEND", "Agg")
 
-WORLDS = 16
-"""Batch size of the shared fixtures: one size, one compilation."""
-
 
 @pytest.fixture(scope="session")
 def task() -> Task:
-  """The shipped push_plate task."""
+  """The shipped push_plate task. The fixtures below are of a module's own, if it
+  has one, but for ``engines``."""
   return make_task("push_plate")
 
 
@@ -36,8 +37,37 @@ def engines(task: Task) -> dict[str, Callable]:
   }
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def resets(task: Task) -> physics.PhysicsState:
   """``WORLDS`` initial states as the task draws them."""
-  draw = task.sample_resets(np.random.default_rng(3), WORLDS)
-  return physics.initial_state(task.scene, *map(jnp.asarray, draw))
+  return drawn(task, WORLDS)
+
+
+@pytest.fixture(scope="module")
+def draw(task: Task) -> ResetDraw:
+  """Many draws, for statistics."""
+  return task.sample_resets(np.random.default_rng(0), 4000)
+
+
+@pytest.fixture(scope="module")
+def kinematics(task: Task, resets: physics.PhysicsState) -> Kinematics:
+  """Of the initial states: the arm is high over the table."""
+  return jax.jit(make_kinematics(task.scene))(resets)
+
+
+@pytest.fixture(scope="module")
+def neutral(task: Task) -> tuple[np.ndarray, np.ndarray]:
+  """Position and rotation of the tool at the keyframe."""
+  return neutral_tool(task)
+
+
+@pytest.fixture(scope="module")
+def rest(task: Task) -> Callable[[physics.PhysicsState], physics.PhysicsState]:
+  """1.2 s of C MuJoCo with the arm at rest and the hand open."""
+  engine = jax.jit(physics.make_physics("native", task.scene, substeps=240).step)
+
+  def step(state: physics.PhysicsState) -> physics.PhysicsState:
+    worlds = len(state.qpos)
+    return engine(state, jnp.zeros((worlds, 6)), jnp.zeros(worlds))
+
+  return step

@@ -9,18 +9,42 @@ import numpy as np
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
+from apnpql_jax.render import CameraSpec, Geoms, render
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
+from apnpql_jax.sim.scene import Scene
 from apnpql_jax.tasks import Task
+from apnpql_jax.tasks.flip_cup import SHAPES
 from apnpql_jax.tasks.pinch import finger_angle
-from apnpql_jax.tasks.table import TableTask
+
+WORLDS = 16
+"""Batch size of the shared fixtures: one size, one compilation."""
+
+MOTIONS = [
+  (dof, sign * limit * factor, factor < 1)
+  for dof, limit in enumerate([0.05] * 3 + [0.5] * 3)
+  for sign, factor in ((1, 0.8), (1, 1.2), (-1, 1.2))
+]
+"""Degree of freedom of a free body, its speed in m/s or rad/s, whether that is rest."""
 
 
 def drawn(task: Task, worlds: int, *, seed: int = 3) -> PhysicsState:
   """Initial states as the task draws them."""
   draw = task.sample_resets(np.random.default_rng(seed), worlds)
   return physics.initial_state(task.scene, *map(jnp.asarray, draw))
+
+
+def each_cup(task: Task, worlds: int) -> tuple[PhysicsState, np.ndarray]:
+  """Initial states of flip_cup with its shapes in turn, and half of the width and the
+  height of the cups, f64[worlds, 2], m."""
+  draw = task.sample_resets(np.random.default_rng(0), worlds)
+  variant = np.arange(worlds) % len(SHAPES)
+  half = np.array(SHAPES)[variant, 1:] / [1, 2]
+  address, _ = task.scene.free_joint("cup")
+  draw.qpos[:, address + 2] = half[:, 1]
+  draw = draw._replace(variant=variant)
+  return physics.initial_state(task.scene, *map(jnp.asarray, draw)), half
 
 
 def neutral_tool(task: Task) -> tuple[np.ndarray, np.ndarray]:
@@ -59,11 +83,20 @@ def put(
   return state.replace(qpos=qpos)
 
 
-def with_gap(task: Task, state: PhysicsState, gap: float) -> PhysicsState:
-  """The pads are ``gap`` m apart."""
+def moving(
+  task: Task, state: PhysicsState, body: str, dof: int, speed: float
+) -> PhysicsState:
+  """Gives a free body a speed; see ``MOTIONS``."""
+  _, start = task.scene.free_joint(body)
+  return state.replace(qvel=state.qvel.at[:, start + dof].set(speed))
+
+
+def with_gap(task: Task, state: PhysicsState, gap) -> PhysicsState:
+  """The pads are ``gap`` m apart: a number, or f64[worlds]."""
   fingers = [task.scene.model.joint(f"finger_{x}") for x in ("r1", "r2", "l1", "l2")]
   address = np.array([finger.qposadr[0] for finger in fingers])
-  return state.replace(qpos=state.qpos.at[:, address].set(finger_angle(gap)))
+  angle = jnp.broadcast_to(finger_angle(gap), len(state.qpos))[:, None]
+  return state.replace(qpos=state.qpos.at[:, address].set(angle))
 
 
 def tool_at(task: Task, kinematics: Kinematics, where, mat=None) -> Kinematics:
@@ -75,19 +108,30 @@ def tool_at(task: Task, kinematics: Kinematics, where, mat=None) -> Kinematics:
   return kinematics.replace(site_xmat=kinematics.site_xmat.at[:, tool].set(mat))
 
 
+def segmentation(
+  scene: Scene, kinematics: Kinematics, size: tuple[int, int] = (72, 96)
+) -> np.ndarray:
+  """Ids of the geoms that the camera over the table sees, i32[worlds, H, W]."""
+  camera = scene.id("camera", "global")
+  image = render(
+    Geoms.from_model(scene.model),
+    CameraSpec.from_model(scene.model, "global", height=size[0], width=size[1]),
+    kinematics.geom_xpos,
+    kinematics.geom_xmat,
+    kinematics.cam_xpos[:, camera],
+    kinematics.cam_xmat[:, camera],
+    fields=kinematics.fields,
+    outputs=("segmentation",),
+  )
+  return np.asarray(image.segmentation)
+
+
 def assert_uniform(values, low, high) -> None:
   """Every column of ``values`` f64[n, ...] is uniform between ``low`` and ``high``."""
   share = (values - low) / (np.asarray(high) - low)
   assert share.min() >= 0 and share.max() <= 1
   for column in share.reshape(len(share), -1).T:
     assert stats.kstest(column, "uniform").pvalue > 1e-3
-
-
-def assert_arm_is_uniform(task: TableTask, qpos: np.ndarray) -> None:
-  """The arm of drawn states f64[n, nq] is around its neutral configuration."""
-  joints = task.scene.arm_qpos
-  arm = qpos[:, joints] - task.scene.keyframe("neutral")[joints]
-  assert_uniform(arm, -task.arm_noise, task.arm_noise)
 
 
 def assert_pairs_are_uniform(pairs, low, high, *, distance, least) -> None:

@@ -1,10 +1,11 @@
-"""What `apnpql list --contacts` prints."""
+"""What `apnpql list --contacts` measures and prints."""
 
 from __future__ import annotations
 
 import mujoco
 import pytest
 
+from apnpql_jax.cli import _show_names
 from apnpql_jax.contact_report import contact_report
 from apnpql_jax.tasks import make_task, task_names
 
@@ -43,7 +44,13 @@ def test_slots_are_those_of_the_pairs(name):
   assert others == model.neq + model.jnt_limited.sum()
 
 
-def test_speed_is_measured_per_engine():
+def test_speed_is_measured_per_engine_and_printed():
   report = contact_report(make_task("push_plate"), backends=("native",))
   assert report["native_steps_per_s"] > 0
   assert "mjx_steps_per_s" not in report
+  line = _show_names({"push_plate": report})
+  words = (
+    "push_plate  28 pairs, 46 contacts, 151 constraint rows, ",
+    " native steps per s",
+  )
+  assert line.startswith(words[0]) and line.endswith(words[1])

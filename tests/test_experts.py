@@ -1,8 +1,9 @@
-"""Every task's scripted expert on real physics: held-out episodes, disturbances."""
+"""Every task's scripted expert on real physics: held-out episodes, the limits it shares
+with the agent, disturbances."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -10,13 +11,14 @@ import numpy as np
 import pytest
 
 from apnpql_jax.config import EnvConfig
-from apnpql_jax.env import Env, make_env
+from apnpql_jax.env import HISTORY, Env, EnvState, make_env
 from apnpql_jax.evaluate import make_player, play_held_out
 from apnpql_jax.rollout import expert_policy
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.tasks import task_names
 
 ROWS = 128
+WORLDS = 16
 PUSHED = {
   "flip_cup": ("cup", 0.02),
   "push_plate": ("plate", 0.05),
@@ -31,9 +33,7 @@ SWUNG = {
 }
 """Task -> what is turned in the hand, when, and the height in m it has by then."""
 
-
 MJX = [pytest.param((n, "mjx"), marks=pytest.mark.slow) for n in task_names()]
-
 
 ENGINES = [*((name, "native") for name in task_names()), *MJX]
 
@@ -50,20 +50,66 @@ def test_the_expert_solves_its_task(env):
   assert figures["successes"] >= 31
 
 
-def play(env, disturb: Callable[[int, PhysicsState], PhysicsState]) -> int:
-  """Worlds, of 16, that the expert solves in one episode; the state before each period
-  goes through ``disturb``."""
-  step = jax.jit(lambda s, key: env.step(s, env.expert_action(s), key))
-  state = jax.jit(env.reset)(jnp.arange(16))
-  solved, over = np.zeros(16, bool), np.zeros(16, bool)
+@pytest.fixture(scope="module")
+def step(env):
+  return jax.jit(lambda s, key: env.step(s, env.expert_action(s), key))
+
+
+def play(
+  env: Env,
+  step,
+  disturb: Callable[[int, PhysicsState], PhysicsState] = lambda t, physics: physics,
+) -> Iterator[EnvState]:
+  """The instants of ``WORLDS`` episodes and what follows the shorter ones; the state
+  before each period goes through ``disturb``."""
+  state = jax.jit(env.reset)(jnp.arange(WORLDS))
   for t in range(env.config.episode_steps):
     state = step(state.replace(physics=disturb(t, state.physics)), jax.random.key(t))
-    solved |= ~over & np.asarray(state.timestep.terminated)
+    yield state
+
+
+def solved(instants: Iterator[EnvState]) -> int:
+  """Of the first episodes."""
+  done, over = np.zeros(WORLDS, bool), np.zeros(WORLDS, bool)
+  for state in instants:
+    done |= ~over & np.asarray(state.timestep.terminated)
     over |= np.asarray(state.timestep.last)
-  return solved.sum()
+  return done.sum()
 
 
-def test_the_expert_recovers_when_the_object_is_pushed_away(env):
+@pytest.fixture(scope="module")
+def instants(env, step) -> list[EnvState]:
+  """Undisturbed."""
+  return list(play(env, step))
+
+
+def test_it_moves_as_the_agent_may(env, instants):
+  """Its actions lie in the action box; robot states of the approach show the limits of
+  joints and fingers. Later on, contacts brake harder."""
+  actions = np.stack([state.timestep.primitives for state in instants])
+  assert np.abs(actions[..., :6]).max() <= 1.0
+  assert np.isin(actions[..., 6], (0.0, 1.0)).all()
+  period = env.config.control_period_s
+  robot = np.stack([state.timestep.observation.robot for state in instants[:8]])
+  robot = robot.reshape(-1, HISTORY, 7).astype(np.float64)
+  speed = np.diff(robot[..., :6], axis=1) / period
+  assert 0.5 < np.abs(speed).max() < 1.02
+  assert 1.0 < np.abs(np.diff(speed, axis=1)).max() / period < 1.2 * 1.05
+  gap = 2 * (0.0041 + 0.057 * np.cos(robot[..., 6] + np.pi / 6))
+  assert np.abs(np.diff(gap, axis=1)).max() / period < 0.075 * 1.12
+
+
+def test_success_is_rewarded_once(env, instants):
+  """With +1, as the last instant of an episode; the next is the first of another."""
+  reward = np.stack([state.timestep.reward for state in instants])
+  solved = np.stack([state.timestep.terminated for state in instants])
+  elapsed = np.stack([state.elapsed for state in instants])
+  assert solved.any()
+  np.testing.assert_array_equal(reward, solved.astype(np.float32))
+  assert not elapsed[1:][solved[:-1]].any() and not reward[1:][solved[:-1]].any()
+
+
+def test_the_expert_recovers_when_the_object_is_pushed_away(env, step):
   """It is moved aside while the arm approaches."""
   if env.task.name not in PUSHED:
     pytest.skip("a holder is in the way, or a task of your own")
@@ -77,10 +123,10 @@ def test_the_expert_recovers_when_the_object_is_pushed_away(env):
     qpos = physics.qpos.at[:, address : address + 2].add(aside)
     return physics.replace(qpos=qpos)
 
-  assert play(env, push) >= 15
+  assert solved(play(env, step, push)) >= 15
 
 
-def test_the_expert_recovers_when_the_object_swings_in_the_hand(env):
+def test_the_expert_recovers_when_the_object_swings_in_the_hand(env, step):
   if env.task.name not in SWUNG:
     pytest.skip("nothing is carried, or a task of your own")
   body, period, height = SWUNG[env.task.name]
@@ -92,4 +138,4 @@ def test_the_expert_recovers_when_the_object_swings_in_the_hand(env):
     assert (physics.qpos[:, address + 2] > height).mean() > 0.8  # Lifted.
     return physics.replace(qvel=physics.qvel.at[:, dof + 3 : dof + 6].add(3.0))
 
-  assert play(env, swing) >= 15
+  assert solved(play(env, step, swing)) >= 15

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hand_made import MOTIONS
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -104,6 +105,20 @@ def test_up_adds_a_height(height):
   xy = jnp.array([[1.0, 2.0], [3.0, 4.0]])
   expected = np.column_stack([xy, np.broadcast_to(height, 2)])
   np.testing.assert_allclose(geometry.up(xy, height), expected, rtol=1e-6)
+
+
+def test_rest_is_slow_in_every_direction_and_about_every_axis():
+  dof, speed, rests = map(np.array, zip(*MOTIONS, strict=True))
+  twist = np.zeros((len(dof), 6), np.float32)
+  twist[np.arange(len(dof)), dof] = speed
+  np.testing.assert_array_equal(geometry.is_at_rest(jnp.asarray(twist)), rests)
+  # Speeds add up as vectors do; turning and moving do not.
+  for twist, expected in (
+    ([0.04, 0.04, 0, 0, 0, 0], False),
+    ([0, 0, 0, 0.4, 0, -0.4], False),
+    ([0.04, 0, 0, 0.4, 0, 0], True),
+  ):
+    assert geometry.is_at_rest(jnp.array([twist]))[0] == expected
 
 
 def test_norm_has_a_gradient_at_zero():

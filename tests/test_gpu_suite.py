@@ -17,8 +17,8 @@ def run(tmp_path, *args: str) -> dict:
   return json.loads(out.read_text())["sections"]
 
 
-def test_it_knows_all_tasks_and_sections():
-  assert set(gpu_suite.TASKS) == set(task_names())
+def test_its_tasks_and_sections_exist():
+  assert set(gpu_suite.TASKS) <= set(task_names())  # Not a task of your own.
   known = {name.partition("/")[0] for name in gpu_suite.SECTIONS}
   assert known == set(gpu_sections.SECTIONS)
 

@@ -52,6 +52,7 @@ def test_a_carried_object_keeps_its_place_in_the_hand(env):
   first: list[tuple | None] = [None] * WORLDS
   over = np.zeros(WORLDS, bool)
   slip, turn, carried = np.zeros(WORLDS), np.zeros(WORLDS), np.zeros(WORLDS, int)
+  solved = np.zeros(WORLDS, bool)
   for t in range(env.config.episode_steps):
     where, rotation = pose(state.physics, address)
     action, kinematics, state = step(state, jax.random.key(t))
@@ -65,8 +66,9 @@ def test_a_carried_object_keeps_its_place_in_the_hand(env):
       slip[world] = max(slip[world], np.linalg.norm(here[0] - first[world][0]))
       turn[world] = max(turn[world], (here[1] * first[world][1].inv()).magnitude())
       carried[world] += 1
+    solved |= ~over & np.asarray(state.timestep.terminated)
     over |= np.asarray(state.timestep.last)
-  assert (carried > 5).all()
+  assert (carried > 5).all() and solved.all()  # The whole way, half a turn included.
   assert slip.max() < 0.002
   assert np.degrees(turn.max()) < 1.0
 
@@ -77,7 +79,8 @@ def test_what_stands_on_the_table_stays(env):
   step = jax.jit(env.physics.step)
   model = env.task.scene.model
   free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
-  assert free.size
+  if not free.size:
+    pytest.skip("a task of your own, in which nothing stands")
   speeds = model.jnt_dofadr[free, None] + np.arange(6)
   for _ in range(20):
     state = step(state, jnp.zeros((WORLDS, 6)), jnp.zeros(WORLDS))

@@ -2,44 +2,45 @@
 
 from __future__ import annotations
 
-from hand_made import apart, assert_arm_is_uniform, assert_pairs_are_uniform
-import jax
+from hand_made import (
+  MOTIONS,
+  apart,
+  assert_pairs_are_uniform,
+  assert_uniform,
+  moving,
+  pos,
+  put,
+  rotation,
+)
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from apnpql_jax.sim.kinematics import make_kinematics
-from apnpql_jax.tasks import push_plate, task_names
+from apnpql_jax.tasks import push_plate
 
 
 @pytest.fixture(scope="module")
 def solved(task, resets):
   """All worlds with the plate at rest exactly on the goal."""
-  plate, _ = task.scene.free_joint("plate")
   goal = resets.mocap_pos[:, task.scene.mocap("goal"), :2]
-  return resets.replace(qpos=resets.qpos.at[:, plate : plate + 2].set(goal))
+  plate = pos(task, resets, "plate").at[:, :2].set(goal)
+  return put(task, resets, "plate", plate)
 
 
 def judge(task, state) -> np.ndarray:
   return np.asarray(task.success(state, None))
 
 
-def moved(task, state, x=0.0, z=0.0):
-  plate, _ = task.scene.free_joint("plate")
-  qpos = state.qpos.at[:, plate].add(x).at[:, plate + 2].add(z)
-  return state.replace(qpos=qpos)
+def moved(task, state, x=0.0, y=0.0, z=0.0):
+  return put(task, state, "plate", pos(task, state, "plate") + jnp.array([x, y, z]))
 
 
-def test_it_is_registered():
-  assert "push_plate" in task_names()
-
-
-def test_resets_are_unsolved_and_in_range(task, resets):
-  assert not judge(task, resets).any()
-  plate, _ = task.scene.free_joint("plate")
-  qpos, mocap_pos, *_ = task.sample_resets(np.random.default_rng(0), 2000)
-  assert_arm_is_uniform(task, qpos)
-  spots = np.hstack([qpos[:, plate : plate + 2], mocap_pos[:, 0, :2]])
+def test_resets_are_uniform_in_range(task, draw):
+  turn = rotation(task, draw, "plate").as_rotvec()
+  np.testing.assert_allclose(turn[:, :2], 0, atol=1e-12)
+  assert_uniform(turn[:, 2], -np.pi, np.pi)
+  spots = np.hstack([pos(task, draw, "plate")[:, :2], draw.mocap_pos[:, 0, :2]])
   low, high = np.array(push_plate.WORKSPACE).T
   least = push_plate.MIN_DISTANCE
   assert_pairs_are_uniform(spots, low, high, distance=apart, least=least)
@@ -50,24 +51,56 @@ def test_plate_at_rest_on_the_goal_is_success(task, solved):
 
 
 @pytest.mark.parametrize(
-  ("x", "z", "expected"),
-  [(0.029, 0.0, True), (0.031, 0.0, False), (-0.031, 0.0, False), (0.0, 0.02, False)],
+  ("x", "y", "z", "expected"),
+  [
+    (0.029, 0.0, 0.0, True),
+    (0.031, 0.0, 0.0, False),
+    (-0.031, 0.0, 0.0, False),
+    (0.0, -0.029, 0.0, True),
+    (-0.022, 0.022, 0.0, False),  # Round, not square.
+    (0.5, 0.0, 0.0, False),
+    (0.0, 0.0, 0.006, True),
+    (0.0, 0.0, 0.008, False),  # In the air.
+    (0.0, 0.0, 0.1, False),
+  ],
 )
-def test_the_goal_has_an_edge_and_a_height(task, solved, x, z, expected):
-  assert (judge(task, moved(task, solved, x, z)) == expected).all()
+def test_the_goal_has_an_edge_and_a_height(task, solved, x, y, z, expected):
+  assert (judge(task, moved(task, solved, x, y, z)) == expected).all()
 
 
-def test_a_moving_plate_is_no_success(task, solved):
-  _, dof = task.scene.free_joint("plate")
-  sliding = solved.replace(qvel=solved.qvel.at[:, dof].set(0.06))
-  assert not judge(task, sliding).any()
-  resting = solved.replace(qvel=solved.qvel.at[:, dof].set(0.04))
-  assert judge(task, resting).all()
+def turned(task, state, axis, angle):
+  turn = rotation(task, state, "plate") * Rotation.from_euler(axis, angle)
+  return put(task, state, "plate", turn=turn)
 
 
-def test_targets_depend_on_where_the_tool_is(task, resets):
+@pytest.mark.parametrize(
+  ("axis", "angle", "expected"),
+  [("z", 2.0, True), ("x", 0.2, True), ("y", 0.3, False), ("x", np.pi, False)],
+)
+def test_the_plate_must_lie_flat(task, solved, axis, angle, expected):
+  assert (judge(task, turned(task, solved, axis, angle)) == expected).all()
+
+
+def test_a_plate_that_lies_upside_down_is_no_success(task, solved, rest):
+  """Only its floor touches the table, so that its centre is as low as ever."""
+  state = rest(turned(task, solved, "x", np.pi))
+  np.testing.assert_allclose(pos(task, state, "plate")[:, 2], 0.003, atol=1e-3)
+  assert not judge(task, state).any()
+
+
+def test_a_dropped_plate_counts_when_it_has_landed(task, solved, rest):
+  state = moved(task, solved, z=0.03)
+  assert not judge(task, state).any()
+  assert judge(task, rest(state)).all()
+
+
+@pytest.mark.parametrize(("dof", "speed", "rests"), MOTIONS)
+def test_a_moving_plate_is_no_success(task, solved, dof, speed, rests):
+  assert (judge(task, moving(task, solved, "plate", dof, speed)) == rests).all()
+
+
+def test_targets_depend_on_where_the_tool_is(task, resets, kinematics):
   """Above and off the plate: hover. Above it: descend. Inside it: drag."""
-  kinematics = jax.jit(make_kinematics(task.scene))(resets)
   plate, _ = task.scene.free_joint("plate")
   spot = resets.qpos[:, plate : plate + 2]
   goal = resets.mocap_pos[:, 0, :2]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hand_made import each_cup, pos, put, segmentation
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 import render_oracles
 
+from apnpql_jax.config import EnvConfig
+from apnpql_jax.env import Env, make_env
 from apnpql_jax.presets import mjcf_path
-from apnpql_jax.render import CameraSpec, Geoms, render
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.tasks import flip_cup, make_task
@@ -37,23 +39,30 @@ def models(task) -> list[mujoco.MjModel]:
 @pytest.fixture(scope="module")
 def state(task) -> physics.PhysicsState:
   """Cups of all shapes, twice: spinning high in the air, and just above the table."""
-  draw = task.sample_resets(np.random.default_rng(0), WORLDS)
-  variant = np.arange(WORLDS) % len(flip_cup.SHAPES)
-  address, dof = task.scene.free_joint("cup")
-  heights = np.array(flip_cup.SHAPES)[variant, 2] / 2
-  draw.qpos[:, address + 2] = heights + np.repeat([0.2, 0.002], 3)
-  draw = draw._replace(variant=variant)
-  state = physics.initial_state(task.scene, *map(jnp.asarray, draw))
+  state, _ = each_cup(task, WORLDS)
+  _, dof = task.scene.free_joint("cup")
+  raised = pos(task, state, "cup").at[:, 2].add(np.repeat([0.2, 0.002], 3))
+  state = put(task, state, "cup", raised)
   return state.replace(qvel=state.qvel.at[:3, dof + 3 : dof + 6].set([2.0, 0.0, 2.0]))
 
 
 @pytest.fixture(scope="module", params=["native", "mjx"])
-def moved(request, task, state) -> np.ndarray:
-  """Pose of the cups after 0.15 s, f32[WORLDS, 7]."""
+def fall(request, task):
+  """Poses of the cups after 0.15 s with the arm at rest, f32[WORLDS, 7]."""
   engine = physics.make_physics(request.param, task.scene, substeps=30)
-  after = jax.jit(engine.step)(state, jnp.zeros((WORLDS, 6)), jnp.zeros(WORLDS))
   address, _ = task.scene.free_joint("cup")
-  return np.asarray(after.qpos)[:, address : address + 7]
+
+  @jax.jit
+  def fall(state: physics.PhysicsState) -> jax.Array:
+    after = engine.step(state, jnp.zeros((WORLDS, 6)), jnp.zeros(WORLDS))
+    return after.qpos[:, address : address + 7]
+
+  return fall
+
+
+@pytest.fixture(scope="module")
+def moved(state, fall) -> np.ndarray:
+  return np.asarray(fall(state))
 
 
 def test_each_cup_spins_with_its_own_inertia(task, models, state, moved):
@@ -78,20 +87,59 @@ def test_each_cup_stands_on_its_own_height(moved):
   np.testing.assert_allclose(moved[3:, 2], heights, atol=1e-3)
 
 
+def test_worlds_change_their_shapes_without_recompilation(state, fall, moved):
+  """Each world is what its neighbour was, of another shape."""
+  after = fall(jax.tree.map(lambda x: jnp.roll(x, 1, axis=0), state))
+  np.testing.assert_allclose(after, np.roll(moved, 1, axis=0), atol=1e-6)
+  assert fall._cache_size() == 1
+
+
+@pytest.fixture(
+  scope="module", params=["native", pytest.param("mjx", marks=pytest.mark.slow)]
+)
+def env(request) -> Env:
+  """With episodes of two periods."""
+  return make_env(
+    EnvConfig(
+      task="flip_cup",
+      obs="state",
+      backend=request.param,
+      bank_rows=128,
+      time_limit_s=0.3,
+    )
+  )
+
+
+@pytest.fixture(scope="module")
+def env_step(env):
+  return jax.jit(env.step)
+
+
+def test_every_reset_draws_a_shape_without_recompilation(env, env_step):
+  worlds = 16
+  state = jax.jit(env.reset)(jnp.arange(worlds))
+  still, seen, fresh = jnp.zeros((worlds, 7)), [], []
+  for t in range(9):
+    seen.append(np.asarray(env.task.objects(state.physics))[:, [2, 9, 10]])
+    fresh.append(np.asarray(state.elapsed) == 0)
+    state = env_step(state, still, jax.random.key(t))
+  # The cup's height over the table, half of its width and half of its height.
+  (height, *size), fresh = np.moveaxis(np.stack(seen), -1, 0), np.stack(fresh)
+  np.testing.assert_allclose(height, size[1], atol=1e-3)
+  shape = np.abs(size[1][..., None] - np.array(flip_cup.SHAPES)[:, 2] / 2).argmin(-1)
+  shapes = np.array(flip_cup.SHAPES)[shape]
+  np.testing.assert_allclose(np.stack(size, -1), shapes[..., 1:] / [1, 2], rtol=1e-6)
+  changed = np.diff(shape, axis=0) != 0
+  assert not changed[~fresh[1:]].any()
+  assert 0.3 < changed[fresh[1:]].mean() < 1.0
+  assert fresh.sum(0).tolist() == [3] * worlds
+  assert env_step._cache_size() == 1
+
+
 def test_each_world_is_seen_in_its_own_shape(task, models, state):
   kinematics = jax.jit(make_kinematics(task.scene))(state)
-  scene, size = task.scene, (72, 96)
-  camera = scene.id("camera", "global")
-  image = render(
-    Geoms.from_model(scene.model),
-    CameraSpec.from_model(scene.model, "global", height=size[0], width=size[1]),
-    kinematics.geom_xpos,
-    kinematics.geom_xmat,
-    kinematics.cam_xpos[:, camera],
-    kinematics.cam_xmat[:, camera],
-    fields=kinematics.fields,
-    outputs=("segmentation",),
-  )
+  size = (72, 96)
+  seen = segmentation(task.scene, kinematics, size)
   for world in range(WORLDS):
     model = models[world % len(models)]
     data = mujoco.MjData(model)
@@ -102,7 +150,7 @@ def test_each_world_is_seen_in_its_own_shape(task, models, state):
     expected = render_oracles.cast_rays(model, data, "global", *size)[0]
     # The boxes of a cup share their tops, where either may be seen.
     walls = [model.geom(f"cup_{i}").id for i in range(4)]
-    seen = np.asarray(image.segmentation[world])
-    same = (seen == expected) | (np.isin(seen, walls) & np.isin(expected, walls))
+    same = seen[world] == expected
+    same |= np.isin(seen[world], walls) & np.isin(expected, walls)
     assert np.isin(expected, walls).sum() > 60
     assert (~same).sum() <= 3  # Rays along an edge, in single precision.

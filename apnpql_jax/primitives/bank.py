@@ -140,7 +140,7 @@ def build_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
 
 
 def _settled(
-  task: Task, rng, count: int, report: BankReport
+  task: Task, rng: np.random.Generator, count: int, report: BankReport
 ) -> tuple[physics.PhysicsState, Array]:
   """States that stay where they are while the arm holds still, and their variants."""
   draw = jax.tree.map(jnp.asarray, task.sample_resets(rng, count))

@@ -36,6 +36,10 @@ MIN_DISTANCE = 0.12
 GOAL_TOLERANCE = 0.03
 """m; the mark's radius exceeds the plate's by this much: solved = inside the mark."""
 
+FLAT = 0.97
+"""Cosine of the largest tilt of a plate that lies flat: 14 degrees. Upside down its
+centre is as low as ever, because only its floor touches the table."""
+
 HOVER_HEIGHT = 0.08
 """m; tool height at which the finger tips clear the rim (34 mm)."""
 
@@ -129,7 +133,9 @@ class PushPlate(TableTask):
     distance = geometry.norm(self._plate_xy(state) - self._goal_xy(state))
     twist = state.qvel[:, self._plate_dof : self._plate_dof + 6]
     on_table = state.qpos[:, self._plate + 2] < 0.01
-    return (distance < GOAL_TOLERANCE) & geometry.is_at_rest(twist) & on_table
+    axis = geometry.axis(state.qpos[:, self._plate + 3 : self._plate + 7], 2)
+    lies = on_table & (axis[:, 2] > FLAT)
+    return (distance < GOAL_TOLERANCE) & geometry.is_at_rest(twist) & lies
 
   def objects(self, state: PhysicsState) -> Array:
     """f32[worlds, 6]: xyz of plate and goal, m."""
