@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import dataclasses
 import functools
+from typing import Any
 
 from batches import random_batch
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tiny
 
 from apnpql_jax import replay
 from apnpql_jax.agents.learner import make_agent
@@ -26,6 +29,12 @@ CONFIG = AgentConfig(
   target_samples=4,
   policy_samples=4,
 )
+
+
+def called(function: Callable, *args: Any) -> Any:
+  """What it returns for these arguments; compiled in a hurry, as it is called once."""
+  lowered: Any = jax.jit(function).lower(*args)
+  return lowered.compile(compiler_options=tiny.FAST_COMPILE)(*args)
 
 
 def episodes(steps: int = 64, worlds: int = 16) -> Replay:
@@ -59,12 +68,11 @@ def error_after_learning(instants: int) -> float:
   def update(state, key):
     return agent.update(state, draw(key), key)
 
-  @jax.jit
   def learn(key):
     state = agent.init(key, draw(key).observation_tm1)
     return jax.lax.scan(update, state, jax.random.split(key, 300))[1]
 
-  metrics = learn(jax.random.key(0))
+  metrics = called(learn, jax.random.key(0))
   assert all(np.isfinite(x).all() for x in metrics.values())
   return float(metrics["ap/error"][-20:].mean())
 
@@ -84,8 +92,8 @@ def test_an_update_from_images_of_several_instants_trains_the_lstm():
   agent = make_agent(config)
   batch = random_batch(0, 4, pixels=True, windows=3, instants=2)
   with jax.numpy_rank_promotion("raise"):
-    state = agent.init(jax.random.key(0), batch.observation_tm1)
-    after, metrics = jax.jit(agent.update)(state, batch, jax.random.key(1))
+    state = called(agent.init, jax.random.key(0), batch.observation_tm1)
+    after, metrics = called(agent.update, state, batch, jax.random.key(1))
   assert all(np.isfinite(x) for x in metrics.values())
   moved = jax.tree.map(
     lambda a, b: np.any(a != b), after.params["encoder"], state.params["encoder"]
