@@ -220,6 +220,10 @@ class AgentConfig:
   """Residual blocks, two 3x3 convolutions each, after the second convolution of each
   camera; the paper has none. Slow on a CPU."""
 
+  lstm_instants: int = codec.added(0)
+  """Instants of an episode, up to the present one, that an LSTM makes phi of (Fig. 2);
+  0: no LSTM. The networks then look at so many times the images."""
+
   global_features: str = codec.added("map")
   """What is kept of the convolutions of the global camera: map (flattened); keypoints
   (where each channel scores highest), which learn from fewer scenes; or both."""

@@ -43,13 +43,26 @@ class EnvState(struct.PyTreeNode):
   elapsed: Array  # i32[worlds]: control periods since the reset
   timestep: TimeStep  # [worlds, ...]: the present instant
   faults: Array  # i32[worlds]: times a world was reset for not being finite
+  recent: Observation | None = None  # [worlds, L, ...]: for agents with an LSTM
+
+  @property
+  def seen(self) -> Observation:
+    """What the agent acts on: the present observation, or the last L of the episode,
+    oldest first, its first one repeated where it is shorter."""
+    return self.timestep.observation if self.recent is None else self.recent
 
 
 class Env:
   """The worlds of one task; holds constants only."""
 
   def __init__(
-    self, config: EnvConfig, task: Task, bank: ResetBank, mesh: Mesh | None = None
+    self,
+    config: EnvConfig,
+    task: Task,
+    bank: ResetBank,
+    mesh: Mesh | None = None,
+    *,
+    instants: int = 0,
   ):
     """
     Args:
@@ -57,6 +70,7 @@ class Env:
       task: the task.
       bank: its reset states.
       mesh: the devices between which the worlds are split; one device if None.
+      instants: L of ``EnvState.seen``; 0 for the present observation alone.
     """
     scene = task.scene
     substeps = _substeps(config, scene)
@@ -65,6 +79,7 @@ class Env:
     self.mesh = mesh
     self.physics = physics.make_physics(config.backend, scene, substeps=substeps)
     self._bank = bank
+    self._instants = instants
     self._chain = arm.make_chain(scene)
     self._kinematics = make_kinematics(scene)
     self._cameras = make_cameras(config, scene)
@@ -78,7 +93,7 @@ class Env:
     """The same worlds without a mesh, for evaluations and videos."""
     if self.mesh is None:
       return self
-    return Env(self.config, self.task, self._bank)
+    return Env(self.config, self.task, self._bank, instants=self._instants)
 
   @property
   def bank_split(self) -> int:
@@ -98,7 +113,7 @@ class Env:
     """
     count = rows.shape[0]
     keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), rows)
-    return self._arrive(
+    state = self._arrive(
       self._initial(rows, keys),
       self._bank.targets[rows],
       elapsed=jnp.zeros(count, jnp.int32),
@@ -106,6 +121,10 @@ class Env:
       history=jnp.zeros((count, HISTORY * 7)),
       faults=jnp.zeros(count, jnp.int32),
     )
+    if not self._instants:
+      return state
+    repeated = functools.partial(_repeated, count=self._instants)
+    return state.replace(recent=jax.tree.map(repeated, state.timestep.observation))
 
   def step(self, state: EnvState, action: Array, key: Array) -> EnvState:
     """One control period in every world.
@@ -137,7 +156,7 @@ class Env:
       targets: f32[worlds, 3, 6], joint targets of episodes that begin, rad.
       fresh: bool[worlds], where they do.
     """
-    return self._arrive(
+    state = self._arrive(
       now,
       _where(fresh, targets, before.targets),
       elapsed=jnp.where(fresh, 0, before.elapsed + 1),
@@ -145,6 +164,15 @@ class Env:
       history=before.timestep.observation.robot,
       faults=before.faults,
     )
+    if before.recent is None:
+      return state
+
+    def follow(recent: Array, new: Array) -> Array:
+      recent = _where(fresh, _repeated(new, recent.shape[1]), recent)
+      return jnp.concatenate([recent[:, 1:], new[:, None]], axis=1)
+
+    recent = jax.tree.map(follow, before.recent, state.timestep.observation)
+    return state.replace(recent=recent)
 
   def tool_targets(self, state: PhysicsState) -> tuple[Array, Array, Array]:
     """See ``Task.tool_targets``."""
@@ -239,12 +267,13 @@ class Env:
     return seen.replace(global_image=overview, wrist_image=wrist)
 
 
-def make_env(config: EnvConfig, mesh: Mesh | None = None) -> Env:
+def make_env(config: EnvConfig, mesh: Mesh | None = None, *, instants: int = 0) -> Env:
   """The worlds of ``config.task``; builds the reset bank on first use.
 
   Args:
     config: see ``Env``.
     mesh: see ``Env``.
+    instants: see ``Env``; ``agent.lstm_instants`` of the agent that acts there.
 
   Raises:
     ConfigError: unknown task or backend, a scene that cannot be simulated or drawn, a
@@ -254,7 +283,7 @@ def make_env(config: EnvConfig, mesh: Mesh | None = None) -> Env:
   # What cannot be drawn is refused before the bank is built.
   make_cameras(config, task.scene)
   bank, _ = load_bank(task, config.bank_rows)
-  return Env(config, task, bank, mesh)
+  return Env(config, task, bank, mesh, instants=instants)
 
 
 def _substeps(config: EnvConfig, scene: Scene) -> int:
@@ -267,6 +296,11 @@ def _substeps(config: EnvConfig, scene: Scene) -> int:
       f"scene's timestep, {timestep} s"
     )
   return substeps
+
+
+def _repeated(x: Array, count: int) -> Array:
+  """[worlds, ...] -> [worlds, count, ...]."""
+  return jnp.repeat(x[:, None], count, axis=1)
 
 
 def _where(condition: Array, yes: Array, no: Array) -> Array:

@@ -122,9 +122,10 @@ def evaluate_run(
   config = run_folder.open_run(run_dir).config
   checkpoint.check(run_dir, step, config=config)
   env_config = dataclasses.replace(config.env, backend=backend or config.env.backend)
-  env, agent = make_env(env_config), make_agent(config.agent)
+  env = make_env(env_config, instants=config.agent.lstm_instants)
+  agent = make_agent(config.agent)
   example = jax.eval_shape(
-    lambda rows: agent.init(jax.random.key(0), env.reset(rows).timestep.observation),
+    lambda rows: agent.init(jax.random.key(0), env.reset(rows).seen),
     jnp.zeros(1, jnp.int32),
   )
   memory.check_memory(leaves.nbytes(example), "the learner")

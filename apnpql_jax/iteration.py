@@ -125,6 +125,7 @@ def make_sample(
     n_step=config.agent.n_step,
     gamma=config.agent.gamma,
     windows=agent.networks.evaluation.windows,
+    instants=config.agent.lstm_instants,
   )
   if mesh is None:
     return draw
@@ -188,7 +189,7 @@ def initial_state(
     worlds = env.reset(rows)
     length = config.replay.capacity // config.env.worlds
     state = TrainState(
-      learner=agent.init(keys[1], worlds.timestep.observation),
+      learner=agent.init(keys[1], worlds.seen),
       env=worlds,
       replay=replay.create(example_slot(worlds), length, config.env.worlds),
       expert_replay=None,

@@ -3,7 +3,8 @@
 A slot at time t holds (TimeStep_t, action_t); the reward and the end flags of
 TimeStep_t were received on arriving at t, and the slot after a last one is the
 reset of the next episode. N-step transitions are put together when they are drawn,
-so that no frame is stored twice and N can change without collecting again.
+so that no frame is stored twice and N can change without collecting again. So are
+observations of several instants, for agents with an LSTM.
 """
 
 from __future__ import annotations
@@ -100,10 +101,12 @@ def sample(
   n_step: int,
   gamma: float,
   windows: bool = False,
+  instants: int = 0,
 ) -> Transition:
   """Draws N-step transitions uniformly, with replacement, over all valid starts.
 
-  A start is any slot that is not last and has ``n_step`` slots after it. The reward
+  A start is any slot that is not last, has ``n_step`` slots after it and, with
+  ``instants``, all but one of those before it. The reward
   is sum_{k=1..m} gamma^(k-1) r_{t+k}, where m is the first k with a last step at
   t+k and N if there is none; the discount is gamma^m, zero if t+m terminated.
 
@@ -116,12 +119,15 @@ def sample(
     windows: also return the N instants after the start; past an end of the episode
       that end again, as what follows may be excluded. Without it
       ``Transition.window`` is None.
+    instants: L; each observation is [B, L, ...], what ``EnvState.seen`` was. 0: that of
+      the instant alone.
 
   Returns:
-    Transition [B, ...], weights zero where ``can_sample`` denies the ring and where
-    four candidates per row held fewer than B valid starts.
+    Transition [B, ...], weights zero where the ring holds no start yet and where four
+    candidates per row held fewer than B valid starts.
   """
-  time, world, valid = _draw_starts(replay, key, batch_size, n_step)
+  before = max(instants - 1, 0)
+  time, world, valid = _draw_starts(replay, key, batch_size, n_step, before)
   length, timestep = replay.slots.action.shape[0], replay.slots.timestep
   steps = jnp.arange(n_step)[None, :]
   window = (time[:, None] + 1 + steps) % length  # [B, N]
@@ -133,15 +139,17 @@ def sample(
   powers = jnp.asarray(np.power(gamma, np.arange(n_step + 1)), reward.dtype)
   ended = jnp.take_along_axis(terminated, stop[:, None], axis=1)[:, 0]
   window = (time[:, None] + 1 + jnp.minimum(steps, stop[:, None])) % length
+  look = functools.partial(_slots, replay, instants=instants)
+  start, end = look(time, world), look(window[:, -1], world)
   return Transition(
-    observation_tm1=_gather(timestep.observation, time, world),
-    action_tm1=_gather(replay.slots.action, time, world),
+    observation_tm1=start.timestep.observation,
+    action_tm1=start.action,
     reward_t=jnp.sum(jnp.where(counted, reward, 0.0) * powers[None, :-1], axis=1),
     discount_t=jnp.where(ended, 0.0, powers[stop + 1]),
-    observation_t=_gather(timestep.observation, window[:, -1], world),
-    primitives_tm1=_gather(timestep.primitives, time, world),
+    observation_t=end.timestep.observation,
+    primitives_tm1=start.timestep.primitives,
     weight=valid.astype(reward.dtype),
-    window=_gather(replay.slots, window, world[:, None]) if windows else None,
+    window=look(window, world[:, None]) if windows else None,
   )
 
 
@@ -162,6 +170,7 @@ def sample_mixed(
   n_step: int,
   gamma: float,
   windows: bool = False,
+  instants: int = 0,
 ) -> Transition:
   """``sample`` of both replays: agent rows first, then ``expert_count`` expert rows.
 
@@ -173,7 +182,9 @@ def sample_mixed(
   if from_expert and expert_replay is None:
     raise ValueError(f"expert_share {expert_share} needs an expert replay")
   counts = ((agent_replay, batch_size - from_expert), (expert_replay, from_expert))
-  draw = functools.partial(sample, n_step=n_step, gamma=gamma, windows=windows)
+  draw = functools.partial(
+    sample, n_step=n_step, gamma=gamma, windows=windows, instants=instants
+  )
   parts = [
     draw(replay, part_key, batch_size=count)
     for (replay, count), part_key in zip(counts, jax.random.split(key), strict=True)
@@ -183,25 +194,47 @@ def sample_mixed(
 
 
 def _draw_starts(
-  replay: Replay, key: Array, batch_size: int, n_step: int
+  replay: Replay, key: Array, batch_size: int, n_step: int, before: int
 ) -> tuple[Array, Array, Array]:
   """Time index, world and validity, each [B]. Draws candidates, keeps valid ones first.
 
-  Candidates are independent and uniform over the slots with n_step after them, hence
-  those kept are so over the valid ones.
+  Candidates are independent and uniform over the slots with n_step after and
+  ``before`` before them, hence those kept are so over the valid ones.
   """
   length, worlds = replay.slots.action.shape[:2]
   key_offset, key_world = jax.random.split(key)
-  shape, span = (_CANDIDATES * batch_size,), jnp.maximum(replay.size - n_step, 1)
+  shape = (_CANDIDATES * batch_size,)
+  span = jnp.maximum(replay.size - before - n_step, 1)
   # Offsets count from the oldest slot, so that no window reaches across the seam.
   offset = jax.random.randint(key_offset, shape, 0, span)
-  time = (replay.cursor - replay.size + offset) % length
+  time = (replay.cursor - replay.size + before + offset) % length
   world = jax.random.randint(key_world, shape, 0, worlds)
   step = replay.slots.timestep
   terminated, truncated = _gather((step.terminated, step.truncated), time, world)
-  valid = ~(terminated | truncated) & can_sample(replay, n_step=n_step)
+  valid = ~(terminated | truncated) & can_sample(replay, n_step=before + n_step)
   kept = jnp.argsort(~valid, stable=True)[:batch_size]
   return time[kept], world[kept], valid[kept]
+
+
+def _slots(replay: Replay, time: Array, world: Array, *, instants: int) -> Slot:
+  """Slots at (time, world) [*b]; with L ``instants``, observations are [*b, L, ...].
+
+  The episode of a slot begins after the newest end before it; where it is shorter than
+  L, its first observation is repeated.
+  """
+  slots = _gather(replay.slots, time, world)
+  if not instants:
+    return slots
+  length, timestep = replay.slots.action.shape[0], replay.slots.timestep
+  world = world[..., None]
+  earlier = jnp.stack([time - 1 - k for k in range(instants)], axis=-1) % length
+  flags = (timestep.terminated, timestep.truncated)
+  terminated, truncated = _gather(flags, earlier, world)
+  # Slots of the episode before this one; the last column stands for "L - 1 or more".
+  before = jnp.argmax((terminated | truncated).at[..., -1].set(True), axis=-1)
+  past = [time - jnp.minimum(k, before) for k in reversed(range(instants))]
+  seen = _gather(timestep.observation, jnp.stack(past, axis=-1) % length, world)
+  return slots.replace(timestep=slots.timestep.replace(observation=seen))
 
 
 def _gather(tree: Any, time: Array, world: Array) -> Any:

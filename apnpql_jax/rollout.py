@@ -23,7 +23,7 @@ def agent_policy(agent: Agent, params: Params, *, greedy: bool) -> Policy:
   """The learned policy; sees observations only."""
 
   def policy(state: EnvState, key: Array) -> tuple[Array, Array]:
-    action, info = agent.act(params, state.timestep.observation, key, greedy)
+    action, info = agent.act(params, state.seen, key, greedy)
     return action, info["log_prob"]
 
   return policy

@@ -176,7 +176,8 @@ def _start(
   saved = resume and checkpoint.latest_step(run_dir) is not None
   if saved:
     checkpoint.check(run_dir, None, config=config)
-  env, agent = make_env(config.env, mesh), make_agent(config.agent)
+  env = make_env(config.env, mesh, instants=config.agent.lstm_instants)
+  agent = make_agent(config.agent)
   example = example_state(config, env, agent)
   memory.check_memory(leaves.nbytes(example), "the training state")
   if saved:

@@ -25,7 +25,10 @@ NUM_PRIMITIVES = 3
 
 
 class Observation(struct.PyTreeNode):
-  """What the agent sees (paper Sec. V-A). Absent modalities are ``None``."""
+  """What the agent sees (paper Sec. V-A). Absent modalities are ``None``.
+
+  To an agent with an LSTM the last of ``*b`` is that of L instants, oldest first.
+  """
 
   robot: Array  # f32[*b, 21]: last three (6 joint, gripper angle), newest last, rad
   tool: Array | None = None  # f32[*b, 3]: tool position by forward kinematics, m

@@ -29,6 +29,8 @@ MAX_SHIFT = 16
 """Pixels."""
 MAX_SIDE = 1024
 """Pixels."""
+MAX_INSTANTS = 32
+"""A third of an episode of 14 s; a batch has so many times the images."""
 MAX_SHARE = 0.5
 """Largest range of a randomised share or colour: nothing shrinks to nothing."""
 MAX_ABSOLUTE = {
@@ -191,6 +193,10 @@ def _validate_agent(agent: AgentConfig) -> None:
     raise ConfigError(
       f"agent.image_shift={agent.image_shift} must be within [0, {MAX_SHIFT}] pixels"
     )
+  if not 0 <= agent.lstm_instants <= MAX_INSTANTS:
+    raise ConfigError(
+      f"agent.lstm_instants={agent.lstm_instants} must be within [0, {MAX_INSTANTS}]"
+    )
   if not 0.0 <= agent.color_jitter <= 1.0:
     raise ConfigError(f"agent.color_jitter={agent.color_jitter} must be within [0, 1]")
   if not agent.hidden or min(agent.hidden) < 1 or max(agent.hidden) >= 2**31:
@@ -278,10 +284,11 @@ def _validate_replay(config: TrainConfig, memory_bytes: int | None) -> None:
       f"rollout_length = {per_iteration}; use "
       f"{max(1, round(replay.capacity / per_iteration)) * per_iteration}"
     )
-  if replay.capacity // config.env.worlds <= config.agent.n_step + 1:
+  fewest = config.agent.n_step + 2 + max(config.agent.lstm_instants - 1, 0)
+  if replay.capacity // config.env.worlds < fewest:
     raise ConfigError(
       f"replay.capacity={replay.capacity} holds no {config.agent.n_step}-step "
-      f"transition; use at least {(config.agent.n_step + 2) * config.env.worlds}"
+      f"transition; use at least {fewest * config.env.worlds}"
     )
   need = replay_bytes(config)
   if memory_bytes is not None and need > memory_bytes:

@@ -56,7 +56,8 @@ def measure_all(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
   """Figures of one setting."""
-  env, agent = make_env(config.env), make_agent(config.agent)
+  env = make_env(config.env, instants=config.agent.lstm_instants)
+  agent = make_agent(config.agent)
   worlds, length = config.env.worlds, config.rollout_length
   updates = config.updates_per_iteration
   state = initial_state(config, env, agent, empty_expert)

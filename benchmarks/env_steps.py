@@ -39,10 +39,11 @@ def main() -> None:
 
 def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
   """Figures of one setting."""
-  env, agent = make_env(config.env), make_agent(config.agent)
+  env = make_env(config.env, instants=config.agent.lstm_instants)
+  agent = make_agent(config.agent)
   worlds, length = config.env.worlds, config.rollout_length
   state = jax.jit(env.reset)(jnp.arange(worlds) % env.bank_split)
-  params = jax.jit(agent.init)(jax.random.key(0), state.timestep.observation).params
+  params = jax.jit(agent.init)(jax.random.key(0), state.seen).params
   found = parts.measure(env, agent, params, state, repeats=repeats)
   policies: dict[str, Callable[[Any], Policy]] = {
     "env": lambda params: parts.random_policy,

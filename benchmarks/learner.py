@@ -2,6 +2,7 @@
 
   python benchmarks/learner.py --quick
   python benchmarks/learner.py --store
+  python benchmarks/learner.py --batch 64 --candidates 120 --lstm-instants 4
 
 The agent is that of a preset, its transitions are noise. The features phi of a state
 are computed once and serve all candidate actions; "repeated" is the same learner that
@@ -43,11 +44,15 @@ def main() -> None:
   parser.add_argument("--preset", default="push_plate")
   parser.add_argument("--batch", type=int, nargs="+", default=[32, 64, 128])
   parser.add_argument("--candidates", type=int, nargs="+", default=[30, 120])
+  parser.add_argument("--lstm-instants", type=int, help="the preset's if left out")
   args = timing.parse(parser)
   config = load_preset(args.preset).agent
   if args.quick:
     args.batch, args.candidates, config = [8], [8], tiny.CONFIG.agent
-  timing.publish("learner", args, measure_all(config, args), preset=args.preset)
+  if args.lstm_instants is not None:
+    config = dataclasses.replace(config, lstm_instants=args.lstm_instants)
+  header = {"preset": args.preset, "lstm_instants": config.lstm_instants}
+  timing.publish("learner", args, measure_all(config, args), **header)
 
 
 def measure_all(
@@ -55,7 +60,7 @@ def measure_all(
 ) -> Iterator[dict[str, Any]]:
   """Figures of every setting, one after the other."""
   for batch, candidates in itertools.product(args.batch, args.candidates):
-    transitions = random_batch(0, batch, pixels=True)
+    transitions = random_batch(0, batch, pixels=True, instants=config.lstm_instants)
     for phi, build in (("once", make_agent), ("repeated", forgetful_agent)):
       agent = build(with_candidates(config, candidates))
       times, compile_s, floor_s = measure(agent, transitions, args.repeats)

@@ -46,7 +46,8 @@ def main() -> None:
 def measure(args: argparse.Namespace) -> dict[str, int]:
   """Bytes of what is sent, and of what it is made of."""
   config, mesh = load_preset(args.preset), sharding.make_mesh(args.devices)
-  env, agent = make_env(config.env, mesh), make_agent(config.agent)
+  env = make_env(config.env, mesh, instants=config.agent.lstm_instants)
+  agent = make_agent(config.agent)
   state = example_state(config, env, agent)
   sample = make_sample(config, agent, mesh)
 

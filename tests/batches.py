@@ -10,9 +10,15 @@ from apnpql_jax.types import Observation, Slot, TimeStep, Transition
 
 
 def random_batch(
-  seed: int, batch: int = 16, *, pixels: bool = False, windows: int = 0
+  seed: int,
+  batch: int = 16,
+  *,
+  pixels: bool = False,
+  windows: int = 0,
+  instants: int = 0,
 ) -> Transition:
-  """Transitions with noise for everything; with a window of N instants if asked."""
+  """Transitions with noise for everything; with a window of N instants if asked, and
+  with observations of L instants each."""
   rng = np.random.default_rng(seed)
 
   def normal(*shape: int) -> jax.Array:
@@ -25,6 +31,7 @@ def random_batch(
     return jnp.asarray(rng.integers(0, 256, shape), jnp.uint8) if pixels else None
 
   def observation(*shape: int) -> Observation:
+    shape += (instants,) * bool(instants)
     return Observation(
       robot=normal(*shape, 21),
       global_image=image(*shape, 72, 96, 3),

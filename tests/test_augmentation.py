@@ -100,6 +100,26 @@ def test_only_images_change_and_each_by_itself():
   )
 
 
+def test_images_of_one_window_are_changed_alike():
+  """Where all three instants show the same, they still do, but something else."""
+  batch = random_batch(0, 4, pixels=True, windows=2, instants=3)
+  batch = jax.tree.map(
+    lambda x: x[..., :1, :, :, :].repeat(3, -4) if x.dtype == np.uint8 else x, batch
+  )
+  other = augment(jax.random.key(0), batch, shift=3, jitter=0.1, together=True)
+  assert batch.window is not None and other.window is not None
+  for before, after in (
+    (batch.observation_tm1, other.observation_tm1),
+    (batch.observation_t, other.observation_t),
+    (batch.window.timestep.observation, other.window.timestep.observation),
+  ):
+    for name in ("global_image", "wrist_image"):
+      old, new = np.asarray(getattr(before, name)), np.asarray(getattr(after, name))
+      assert new.shape == old.shape and new.dtype == np.uint8
+      assert np.not_equal(old, new).any((-4, -3, -2, -1)).all()
+      np.testing.assert_array_equal(new, new[..., :1, :, :, :].repeat(3, -4))
+
+
 @pytest.mark.parametrize("settings", [{"image_shift": 2}, {"color_jitter": 0.2}])
 def test_the_learner_sees_augmented_images_only_if_asked(settings):
   """The program of an update without them holds nothing of them."""

@@ -70,6 +70,7 @@ SLOW = pytest.mark.slow
     ("env_steps", ["--obs", "state"]),
     ("growth", ["--axes", "candidates", "slots"]),
     pytest.param("learner", [], marks=SLOW),
+    pytest.param("learner", ["--lstm-instants", "2"], marks=SLOW),
     pytest.param("env_steps", [], marks=SLOW),
     pytest.param("end_to_end", [], marks=SLOW),
     pytest.param("compile_time", [], marks=SLOW),

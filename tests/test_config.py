@@ -114,6 +114,7 @@ def test_every_field_has_a_docstring():
     ("agent.gamma", 1.5, ["(0, 1]"]),
     ("agent.v_min", 1.0, ["agent.v_max"]),
     ("agent.hidden", (), ["agent.hidden"]),
+    ("agent.lstm_instants", 33, ["[0, 32]"]),
     ("agent.target_samples", 1, ["at least 2"]),
     ("agent.learning_rate_e", float("inf"), ["finite"]),
     ("replay.expert_share", 0.3, ["replay.batch_size", "0.296875"]),
@@ -183,6 +184,13 @@ def test_replay_larger_than_memory_is_refused():
   large = replay_bytes(changed("env.global_size", (120, 160)))
   slots = ReplayConfig().capacity + ReplayConfig().expert_steps
   assert large - need == 3 * (120 * 160 - 72 * 96) * slots
+
+
+def test_a_replay_must_hold_what_an_lstm_looks_back_on():
+  config = changed("replay.capacity", 256)  # Eight instants of each world.
+  validate(replaced(config, ["agent", "lstm_instants"], 4))
+  with pytest.raises(ConfigError, match="replay.capacity=256 .* at least 288"):
+    validate(replaced(config, ["agent", "lstm_instants"], 5))
 
 
 def test_demonstrations_do_not_show_randomised_worlds():

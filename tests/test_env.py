@@ -10,11 +10,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from apnpql_jax.config import EnvConfig
+from apnpql_jax import replay
+from apnpql_jax.agents.learner import make_agent
+from apnpql_jax.config import AgentConfig, EnvConfig
 from apnpql_jax.env import Env, make_env
 from apnpql_jax.evaluate import make_player, play_held_out
-from apnpql_jax.rollout import expert_policy, rollout
+from apnpql_jax.iteration import example_slot
+from apnpql_jax.rollout import agent_policy, expert_policy, rollout
 from apnpql_jax.sim import arm
+from apnpql_jax.types import Observation
 
 CONFIG = EnvConfig(obs="state", backend="native", worlds=16, bank_rows=256)
 SHORT = dataclasses.replace(CONFIG, time_limit_s=0.45)
@@ -72,6 +76,39 @@ def test_time_out_truncates_then_resets(env):
   assert (np.abs(robot[4] - robot[0]).max(-1) > 1e-3).mean() > 0.8
   # Within an episode the stack shifts by one state per period.
   np.testing.assert_array_equal(robot[1, :, 7:14], robot[0, :, 14:])
+
+
+def test_an_lstm_is_shown_by_the_replay_what_it_acted_on(env):
+  """Three instants at a time, of episodes that have four."""
+  short = Env(SHORT, env.task, env._bank, instants=3)
+
+  def velocity(seen: Observation) -> jax.Array:
+    """f32[b] for one joint: another one for other observations, or another order."""
+    whole = jnp.concatenate([x.reshape(len(x), -1) for x in jax.tree.leaves(seen)], 1)
+    weights = jax.random.normal(jax.random.key(0), whole.shape[1:])
+    return jnp.tanh(whole @ weights / 10.0)
+
+  def act(params, seen: Observation, key, greedy):
+    action = jnp.full((16, 7), 0.5).at[:, 0].set(velocity(seen))
+    return action, {"log_prob": jnp.zeros(16)}
+
+  agent = dataclasses.replace(make_agent(AgentConfig()), act=act)
+  policy = agent_policy(agent, {}, greedy=False)
+
+  @jax.jit
+  def play(key):
+    start = short.reset(jnp.arange(16))
+    _, chunk = rollout(short, policy, start, key, length=10)
+    ring = replay.add(replay.create(example_slot(start), 10, 16), chunk)
+    return replay.sample(ring, key, batch_size=256, n_step=2, gamma=0.9, instants=3)
+
+  batch = play(jax.random.key(0))
+  seen = batch.observation_tm1
+  np.testing.assert_allclose(velocity(seen), batch.action_tm1[:, 0], atol=1e-4)
+  # Drawn at the first instant of an episode, the second, and the third.
+  moves = np.any(seen.robot[:, 1:, -7:] != seen.robot[:, :-1, -7:], axis=-1)
+  kinds = np.unique(moves, axis=0)
+  np.testing.assert_array_equal(kinds, [[0, 0], [0, 1], [1, 1]])
 
 
 @pytest.fixture(scope="module")

@@ -55,22 +55,28 @@ class Built(NamedTuple):
 
 def _variants() -> list[Any]:
   first, *others = ALGORITHMS
-  variants = [(first, "native", "pixels"), (first, "mjx", "state")]
-  variants += [(name, "native", "state") for name in others]
-  slow = [pytest.param(v, marks=pytest.mark.slow, id="-".join(v)) for v in variants]
-  return [pytest.param((first, "native", "state"), id=first), *slow]
+  variants = [(first, "native", "pixels", 0), (first, "mjx", "state", 0)]
+  variants += [(name, "native", "state", 0) for name in others]
+  variants += [(first, "native", "pixels", 3), ("svg_prior", "native", "state", 3)]
+  slow = [
+    pytest.param(v, marks=pytest.mark.slow, id="-".join(map(str, v))) for v in variants
+  ]
+  return [pytest.param((first, "native", "state", 0), id=first), *slow]
 
 
 @pytest.fixture(scope="module", params=_variants())
 def built(request) -> Built:
-  algorithm, backend, obs = request.param
+  algorithm, backend, obs, instants = request.param
+  agent = dataclasses.replace(
+    tiny.CONFIG.agent, algorithm=algorithm, lstm_instants=instants
+  )
   config = dataclasses.replace(
     tiny.CONFIG,
     env=dataclasses.replace(tiny.CONFIG.env, backend=backend, obs=obs),
-    agent=dataclasses.replace(tiny.CONFIG.agent, algorithm=algorithm),
+    agent=agent,
     max_skipped_updates=2,
   )
-  env, agent = make_env(config.env), make_agent(config.agent)
+  env, agent = make_env(config.env, instants=instants), make_agent(config.agent)
   state = initial_state(config, env, agent, collect_expert)
   assert all(x.committed for x in jax.tree.leaves(state))
   jitted: Any = make_iteration(config, env, agent)

@@ -123,6 +123,39 @@ def expected_positions(scores: jax.Array) -> np.ndarray:
   return np.stack([row, column], axis=-1).reshape(len(shares), -1)
 
 
+def test_an_lstm_reads_what_would_be_phi_of_each_instant():
+  plain = all_networks()
+  networks = all_networks(dataclasses.replace(CONFIG, lstm_instants=3))
+  seen = observation(2 * 3, pixels=True).replace(global_image=None)
+  recent = jax.tree.map(lambda x: x.reshape(2, 3, *x.shape[1:]), seen)
+  params = networks.init(jax.random.key(0), recent)
+  lstm = params["encoder"]["lstm"]
+  without = {k: v for k, v in params["encoder"].items() if k != "lstm"}
+  # Nothing else is new, and nothing else begins elsewhere.
+  jax.tree.map(
+    np.testing.assert_array_equal,
+    params | {"encoder": without},
+    plain.init(jax.random.key(0), seen),
+  )
+  rng = np.random.default_rng(4)
+  lstm = jax.tree.map(lambda x: rng.normal(size=x.shape).astype(np.float32), lstm)
+  phi = plain.at(params | {"encoder": without}, seen).phi
+  c = h = np.zeros((2, 20))
+  for x in np.asarray(phi, np.float64).reshape(2, 3, 20).swapaxes(0, 1):
+    i, f, g, o = (
+      x @ lstm[f"i{gate}"]["kernel"]
+      + h @ lstm[f"h{gate}"]["kernel"]
+      + lstm[f"h{gate}"]["bias"]
+      for gate in "ifgo"
+    )
+    c = special.expit(f) * c + special.expit(i) * np.tanh(g)
+    h = special.expit(o) * np.tanh(c)
+  actual = networks.at(params | {"encoder": without | {"lstm": lstm}}, recent).phi
+  np.testing.assert_allclose(actual, h, atol=1e-4)
+  with pytest.raises(ValueError, match="not of 3 instants"):
+    networks.at(params, seen)
+
+
 @pytest.mark.parametrize("parts", [1, 4])
 def test_a_keypoint_is_where_its_channel_peaks(parts: int):
   scores = jnp.zeros((3, 4, parts, 2)).at[2, 1, parts - 1, 0].set(100.0)

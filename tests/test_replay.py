@@ -180,6 +180,50 @@ def test_windows_are_the_slots_after_the_start_across_the_seam():
   jax.tree.map(np.testing.assert_array_equal, without, batch.replace(window=None))
 
 
+def _up_to(step: TimeStep, t: int, w: int, instants: int) -> list[int]:
+  """The last slots of an episode up to t, its first one as often as it takes."""
+  slots = [t]
+  while len(slots) < instants:
+    t -= not (step.terminated[t - 1, w] or step.truncated[t - 1, w])
+    slots.insert(0, t)
+  return slots
+
+
+@pytest.mark.parametrize("instants", [1, 4])
+def test_observations_of_several_instants_are_of_one_episode(instants: int):
+  stream = _stream(48, WORLDS, 0.2, seed=4)
+  step = stream.timestep
+  replay = _fill(stream, length=32, chunk=16)  # Newest and oldest slot are neighbours.
+  batch = jax.device_get(
+    rb.sample(
+      replay,
+      jax.random.key(0),
+      batch_size=1000,
+      n_step=3,
+      gamma=GAMMA,
+      windows=True,
+      instants=instants,
+    )
+  )
+  starts = batch.observation_tm1.robot[:, -1].astype(int)
+  # What the oldest slots follow on has been overwritten.
+  valid = {(t, w) for t, w in _valid_starts(step, 32, 3) if t >= 16 + instants - 1}
+  assert {tuple(start) for start in starts} == valid
+  w = starts[:, 1]
+  np.testing.assert_array_equal(batch.action_tm1, stream.action[starts[:, 0], w])
+  after = batch.window.timestep.observation
+  assert after.robot.shape == (1000, 3, instants, 2)
+  np.testing.assert_array_equal(after.robot[:, -1], batch.observation_t.robot)
+  for seen in (batch.observation_tm1, batch.observation_t):
+    t = seen.robot[:, -1, 0].astype(int)
+    past = np.array([_up_to(step, *slot, instants) for slot in zip(t, w, strict=True)])
+    expected = jax.tree.map(lambda x, t=past: x[t, w[:, None]], step.observation)
+    jax.tree.map(np.testing.assert_array_equal, seen, expected)
+  for k, t in enumerate(np.moveaxis(after.robot[:, :, -1, 0], 1, 0).astype(int)):
+    past = np.array([_up_to(step, *slot, instants) for slot in zip(t, w, strict=True)])
+    np.testing.assert_array_equal(after.robot[:, k, :, 0], past)
+
+
 def test_neither_transition_nor_window_reaches_an_excluded_episode():
   """One world: an episode of six slots, then one that breaks and is not numbers."""
   stream = _stream(12, 1, 0.0, seed=0)

@@ -6,6 +6,7 @@ states by single pixels.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import functools
 
 import jax
@@ -16,7 +17,9 @@ from apnpql_jax.types import Array, Observation, Transition
 _IMAGES = ("global_image", "wrist_image")
 
 
-def augment(key: Array, batch: Transition, *, shift: int, jitter: float) -> Transition:
+def augment(
+  key: Array, batch: Transition, *, shift: int, jitter: float, together: bool = False
+) -> Transition:
   """The batch with other images; each image of each instant by itself.
 
   Args:
@@ -24,8 +27,13 @@ def augment(key: Array, batch: Transition, *, shift: int, jitter: float) -> Tran
     batch: [B, ...].
     shift: largest shift along each axis, pixels; 0 for none.
     jitter: largest change of brightness of each colour channel, a share; 0 for none.
+    together: observations are windows [B, L, ...]; all images of a window are changed
+      in the same way, for what differs between them is what an LSTM is to see.
   """
-  changed = functools.partial(_observation, shift=shift, jitter=jitter)
+  change = functools.partial(_image, shift=shift, jitter=jitter)
+  if together:
+    change = jax.vmap(change, in_axes=(None, -4), out_axes=-4)
+  changed = functools.partial(_observation, change)
   keys = jax.random.split(key, 3)
   batch = batch.replace(
     observation_tm1=changed(keys[0], batch.observation_tm1),
@@ -39,19 +47,23 @@ def augment(key: Array, batch: Transition, *, shift: int, jitter: float) -> Tran
 
 
 def _observation(
-  key: Array, observation: Observation, *, shift: int, jitter: float
+  change: Callable[[Array, Array], Array], key: Array, observation: Observation
 ) -> Observation:
   for index, name in enumerate(_IMAGES):
     image = getattr(observation, name)
-    if image is None:
-      continue
-    shift_key, color_key = jax.random.split(jax.random.fold_in(key, index))
-    if shift:
-      image = shifted(shift_key, image, shift)
-    if jitter:
-      image = jittered(color_key, image, jitter)
-    observation = observation.replace(**{name: image})
+    if image is not None:
+      image = change(jax.random.fold_in(key, index), image)
+      observation = observation.replace(**{name: image})
   return observation
+
+
+def _image(key: Array, image: Array, *, shift: int, jitter: float) -> Array:
+  shift_key, color_key = jax.random.split(key)
+  if shift:
+    image = shifted(shift_key, image, shift)
+  if jitter:
+    image = jittered(color_key, image, jitter)
+  return image
 
 
 def shifted(key: Array, image: Array, most: int) -> Array:

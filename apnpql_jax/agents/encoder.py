@@ -84,6 +84,10 @@ class Encoder(nn.Module):
   drown a few dozen of the robot. The layer
   norm gives phi a fixed scale: the heads that read phi without training it (prior,
   alpha) then follow the encoder instead of chasing its growing activations.
+
+  An LSTM, if there is one, reads what would be phi of the last instants of an episode.
+  It begins with an empty memory in acting and learning alike. Its last output is phi,
+  which lies within -1 and 1.
   """
 
   feature_dim: int
@@ -92,10 +96,17 @@ class Encoder(nn.Module):
   residual_blocks: int
   global_features: str
   wrist_features: str
+  lstm_instants: int
 
   @nn.compact
   def __call__(self, observation: Observation) -> Array:
-    """Observation with batch *b -> f32[*b, feature_dim]."""
+    """Observation with batch *b -> f32[*b, feature_dim].
+
+    With an LSTM that reads L instants the observation has [*b, L, ...], oldest first.
+
+    Raises:
+      ValueError: it has another number of instants than the LSTM reads.
+    """
     body = functools.partial(nn.Dense, self.feature_dim)
     state = [robot_inputs(observation.robot)]
     for positions in (observation.tool, observation.objects):
@@ -116,7 +127,13 @@ class Encoder(nn.Module):
           maps.append(body(name=f"from_{name}", use_bias=False)(pixels))
     state = nn.relu(body(name="state")(jnp.concatenate(state, axis=-1)))
     x = sum(maps, body(name="from_state")(state))
-    return nn.relu(nn.LayerNorm(name="norm")(x))
+    x = nn.relu(nn.LayerNorm(name="norm")(x))
+    if not self.lstm_instants:
+      return x
+    if x.shape[-2:-1] != (self.lstm_instants,):
+      raise ValueError(f"features {x.shape} are not of {self.lstm_instants} instants")
+    cell = nn.OptimizedLSTMCell(self.feature_dim, name="lstm")
+    return nn.RNN(cell, unroll=self.lstm_instants)(x)[..., -1, :]
 
 
 def keypoints(scores: Array) -> Array:

@@ -89,6 +89,7 @@ def make_agent(config: AgentConfig) -> Agent:
         batch,
         shift=config.image_shift,
         jitter=config.color_jitter,
+        together=config.lstm_instants > 0,
       )
     target = bellman_target(networks, algorithm, state.target_params, batch, key_t)
     trained = {**state.params, "nu": state.nu}

@@ -164,6 +164,7 @@ def make_networks(
       config.residual_blocks,
       config.global_features,
       config.wrist_features,
+      config.lstm_instants,
     ),
     "ap": Head(hidden, NUM_PRIMITIVES * ACTION_DIM),
     "bp": Head(hidden, NUM_PRIMITIVES * mixture_size(own_mean=learned_mean)),
