@@ -36,7 +36,7 @@ def make_cameras(config: EnvConfig, scene: Scene) -> tuple[Renderer, Renderer]:
 def camera_renderer(
   config: EnvConfig, scene: Scene, name: str, size: tuple[int, int]
 ) -> Renderer:
-  """Returns ``f(kinematics) -> u8[worlds, H, W, 3]`` for a camera of the scene."""
+  """Returns ``f(kinematics) -> u8[*b, H, W, 3]`` for a camera of the scene."""
   index = scene.id("camera", name)
   height, width = size
   spec = CameraSpec.from_model(scene.model, name, height=height, width=width)
@@ -51,8 +51,8 @@ def camera_renderer(
       spec,
       kinematics.geom_xpos,
       kinematics.geom_xmat,
-      kinematics.cam_xpos[:, index],
-      kinematics.cam_xmat[:, index],
+      kinematics.cam_xpos[..., index, :],
+      kinematics.cam_xmat[..., index, :, :],
       lighting,
       fields=kinematics.fields,
       outputs=("rgb",),

@@ -20,13 +20,15 @@ class ConfigError(ValueError):
   """A setting that cannot work; its one-line message says what to write instead."""
 
 
-def added(value: Any) -> Any:
+def added(default: Any, *, before: Any = None) -> Any:
   """A field that came when texts without it existed.
 
   Args:
-    value: its default, which must mean what was done before there was such a field.
+    default: its default.
+    before: the value that means what was done without it; the default if None.
   """
-  return dataclasses.field(default=value, metadata={_BEFORE: value})
+  before = default if before is None else before
+  return dataclasses.field(default=default, metadata={_BEFORE: before})
 
 
 def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

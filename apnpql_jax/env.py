@@ -20,7 +20,7 @@ from apnpql_jax.cameras import Renderer, make_cameras
 from apnpql_jax.config import ConfigError, EnvConfig
 from apnpql_jax.primitives import tracking
 from apnpql_jax.primitives.bank import ResetBank, load_bank
-from apnpql_jax.randomization import make_randomize
+from apnpql_jax.randomization.worlds import make_randomize
 from apnpql_jax.sim import arm, physics
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.sim.physics import PhysicsState

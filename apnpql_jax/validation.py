@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from apnpql_jax import codec
 from apnpql_jax.codec import ConfigError
+from apnpql_jax.randomization.ranges import validate_ranges
 
 if TYPE_CHECKING:
   from apnpql_jax.config import AgentConfig, EnvConfig, TrainConfig
@@ -31,22 +32,6 @@ MAX_SIDE = 1024
 """Pixels."""
 MAX_INSTANTS = 32
 """A third of an episode of 14 s; a batch has so many times the images."""
-MAX_SHARE = 0.5
-"""Largest range of a randomised share or colour: nothing shrinks to nothing."""
-MAX_ABSOLUTE = {
-  "color": 1.0,
-  "texture": 1.0,
-  "light_turn": 0.9,
-  "camera_shift": 0.2,
-  "camera_turn": 0.3,
-  "table_height": 0.1,
-  "table_tilt": 0.1,
-  "size": 0.1,
-  "damping": 2.0,
-  "delay_s": 1.0,
-}
-"""Largest ranges of the others, in their units; objects of other sizes than these
-neither fit into the hand nor into what they are put into."""
 
 _OTHER_BYTES = 4 * (21 + 3 + 7 + 21 + 2) + 2
 """Robot state, tool, action, primitive labels, reward, log density of the action (f32)
@@ -164,10 +149,7 @@ def _validate_env(env: EnvConfig) -> None:
       raise ConfigError(
         f"env.{name}={size} must be height and width, each from 1 to {MAX_SIDE} pixels"
       )
-  for name, value in codec.flatten(env.randomization, "env.randomization."):
-    most = MAX_ABSOLUTE.get(name.rpartition(".")[2], MAX_SHARE)
-    if not 0.0 <= value <= most:
-      raise ConfigError(f"{name}={value} must be within [0, {most}]")
+  validate_ranges(env.randomization, "env.randomization.")
   delay = env.randomization.delay_s
   if env.randomize and delay >= env.control_period_s:
     raise ConfigError(

@@ -13,7 +13,6 @@ import json
 from pathlib import Path
 import sys
 from typing import Any
-from unittest import mock
 
 import apnpql_jax  # isort: skip  (before JAX: sets threads and cache)
 from cures import cures
@@ -24,16 +23,14 @@ import jax.numpy as jnp
 from mujoco import mjx
 import numpy as np
 from parts import random_policy
+from ray_layouts import LAYOUTS, SIZES, Layout
+from render import make_pair, make_poses
 
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.cameras import make_cameras
 from apnpql_jax.config import EnvConfig
 from apnpql_jax.env import EnvState, make_env
 from apnpql_jax.iteration import empty_expert, initial_state, make_iteration
-from apnpql_jax.render import raycast
 from apnpql_jax.rollout import agent_policy, rollout
-from apnpql_jax.sim import physics
-from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.tasks import make_task
 from apnpql_jax.types import Array, Transition
 
@@ -137,23 +134,20 @@ def engines(settings: Settings) -> None:
 
 
 def raycaster(settings: Settings) -> None:
-  """Pairs of images by the layout of the pixels, with shadows and with textures."""
-  count, task = settings["render_worlds"], make_task("push_plate")
-  draw = task.sample_resets(np.random.default_rng(0), count)
-  state = physics.initial_state(task.scene, *map(jnp.asarray, draw))
-  seen = jax.jit(make_kinematics(task.scene))(state)
+  """Pairs of images by the layout of the work, and with shadows."""
+  count, scene = settings["render_worlds"], make_task("push_plate").scene
+  seen = make_poses(scene, count)
+  pairs = {name: LAYOUTS[name].pair(scene) for name in settings["layouts"]}
+  pairs["shadows"] = make_pair(scene, SIZES, shadow=True)
 
-  def lower(blocks: int, shadows: bool) -> Any:
-    cameras = make_cameras(EnvConfig(shadows=shadows), task.scene)
-    with mock.patch.object(raycast, "BLOCKS", blocks):
-      return jax.jit(lambda poses: [camera(poses) for camera in cameras]).lower(seen)
+  def lower(name: str) -> Any:
+    with LAYOUTS.get(name, Layout()).traced():
+      return jax.jit(pairs[name]).lower(seen)
 
-  variants = {f"{n} blocks": (n, False) for n in settings["blocks"]}
-  variants["shadows"] = (raycast.BLOCKS, True)
   measure_all(
     (
-      Item(name, functools.partial(lower, *variant), lambda: (seen,), count, "pairs")
-      for name, variant in variants.items()
+      Item(name, functools.partial(lower, name), lambda: (seen,), count, "pairs")
+      for name in pairs
     ),
     settings,
   )

@@ -3,16 +3,19 @@
   python benchmarks/render.py --quick
   python benchmarks/render.py --store
 
-A pair is one image of "global" and one of "wrist" of the same world. MuJoCo's software
-rendering and PyBullet's TinyRenderer are timed in the same run, where they are
-installed. ``--json`` prints one JSON object and nothing else.
+A pair is one image of "global" and one of "wrist" of the same world; some batches are
+also drawn with the shadow of the hand. MuJoCo's software rendering and PyBullet's
+TinyRenderer are timed in the same run, where they are installed. ``--json`` prints one
+JSON object and nothing else.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator
+import dataclasses
 import functools
+import itertools
 from typing import Any
 
 import timing  # isort: skip  (before JAX: sets threads and cache)
@@ -22,11 +25,16 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from other_renderers import measure_others
-import tables
 
-from apnpql_jax.render import CameraSpec, Geoms, Lighting, render
+from apnpql_jax.cameras import make_cameras
+from apnpql_jax.config import EnvConfig
+from apnpql_jax.presets import mjcf_path
+from apnpql_jax.render import Geoms
+from apnpql_jax.sim.kinematics import Kinematics
+from apnpql_jax.sim.scene import Scene, load_scene
+from apnpql_jax.types import Array
 
-SCENE = tables.ROOT / "mjcf" / "push_plate.xml"
+SCENE = "push_plate"
 RESOLUTIONS = {
   "paper": {"global": (72, 96), "wrist": (36, 64)},
   "sim_to_real": {"global": (120, 160), "wrist": (60, 107)},
@@ -37,42 +45,41 @@ def main() -> None:
   """Command line; see the module's docstring."""
   args = timing.parse(_parser())
   if args.quick:
-    args.batch, args.resolutions = [1, 2], ["paper"]
+    args.batch, args.shadow, args.resolutions = [1, 2], [2], ["paper"]
   resolutions = {name: RESOLUTIONS[name] for name in args.resolutions}
-  model = mujoco.MjModel.from_xml_path(str(SCENE))
+  scene = load_scene(mjcf_path(SCENE))
   timing.publish(
     "render",
     args,
-    measure_all(model, resolutions, args),
-    scene=SCENE.stem,
-    geoms=len(Geoms.from_model(model).ids),
+    measure_all(scene, resolutions, args),
+    scene=SCENE,
+    geoms=len(Geoms.from_model(scene.model).ids),
     resolutions=resolutions,
-    outputs=args.outputs,
-    shadow_casters=args.casters,
   )
 
 
 def measure_all(
-  model: mujoco.MjModel, resolutions: dict[str, Any], args: argparse.Namespace
+  scene: Scene, resolutions: dict[str, Any], args: argparse.Namespace
 ) -> Iterator[dict[str, Any]]:
   """Figures of every renderer and size, one after the other."""
-  for name, cameras in resolutions.items():
-    others = {} if args.alone else measure_others(SCENE, cameras)
+  for name, sizes in resolutions.items():
+    others = {} if args.alone else measure_others(mjcf_path(SCENE), sizes)
     for renderer, found in others.items():
       yield {"resolution": name, "renderer": renderer, **found}
-    pair = _make_pair(model, cameras, args.casters, args.outputs)
-    for size in args.batch:
-      poses = _poses(model, size)
-      run, compile_s = timing.compiled(jax.jit(pair), *poses)
-      times = timing.measure(functools.partial(run, *poses), repeats=args.repeats)
-      floor_s = floor.count(pair, *poses).seconds()
+    plain = itertools.product([False], args.batch)
+    for shadow, batch in [*plain, *itertools.product([True], args.shadow)]:
+      pair, poses = make_pair(scene, sizes, shadow=shadow), make_poses(scene, batch)
+      run, compile_s = timing.compiled(jax.jit(pair), poses)
+      times = timing.measure(functools.partial(run, poses), repeats=args.repeats)
+      floor_s = floor.count(pair, poses).seconds()
       yield {
         "resolution": name,
         "renderer": "ray_caster",
-        "batch": size,
-        **times.per(size).rate("pair"),
+        "batch": batch,
+        "shadow": shadow,
+        **times.per(batch).rate("pair"),
         "compile_s": compile_s,
-        **floor.compare(floor_s / size, times.per(size).seconds),
+        **floor.compare(floor_s / batch, times.per(batch).seconds),
       }
 
 
@@ -87,64 +94,37 @@ def _parser() -> argparse.ArgumentParser:
   parser.add_argument(
     "--batch", type=int, nargs="+", default=[1, 8, 16, 32, 64, 128, 256]
   )
-  parser.add_argument("--outputs", nargs="+", default=["rgb"])
   parser.add_argument(
-    "--casters", nargs="*", default=[], help="geoms that throw shadows on the table"
+    "--shadow", type=int, nargs="*", default=[64], help="batches with a shadow, too"
   )
   return parser
 
 
-def _make_pair(
-  model: mujoco.MjModel,
-  cameras: dict[str, tuple[int, int]],
-  casters: list[str],
-  outputs: list[str],
-) -> Callable:
-  """A function from the poses of a batch to the images of both cameras."""
-  geoms = Geoms.from_model(model)
-  specs = [
-    CameraSpec.from_model(model, name, height=height, width=width)
-    for name, (height, width) in cameras.items()
-  ]
-  lighting = Lighting.from_model(
-    model,
-    shadow_casters=tuple(model.geom(name).id for name in casters),
-    shadow_receivers=(model.geom("table").id,),
-  )
-
-  def pair(geom_xpos, geom_xmat, cam_xpos, cam_xmat):
-    return [
-      render(
-        geoms,
-        camera,
-        geom_xpos,
-        geom_xmat,
-        cam_xpos[:, camera.id],
-        cam_xmat[:, camera.id],
-        lighting,
-        outputs=tuple(outputs),
-      )
-      for camera in specs
-    ]
-
-  return pair
+def make_pair(
+  scene: Scene, sizes: dict[str, tuple[int, int]], *, shadow: bool = False
+) -> Callable[[Kinematics], list[Array]]:
+  """A function from poses [*b, ...] to the images of both cameras, u8[*b, H, W, 3]."""
+  sides: dict[str, Any] = {f"{name}_size": size for name, size in sizes.items()}
+  cameras = make_cameras(EnvConfig(shadows=shadow, **sides), scene)
+  return lambda poses: [camera(poses) for camera in cameras]
 
 
-def _poses(model: mujoco.MjModel, size: int) -> list[jax.Array]:
-  """Poses of geoms and cameras with the arm about its working posture."""
-  data, rng = mujoco.MjData(model), np.random.default_rng(0)
-  batch = []
-  for _ in range(size):
-    mujoco.mj_resetData(model, data)
+def make_poses(scene: Scene, batch: int) -> Kinematics:
+  """Worlds [batch, ...] with the arm about its working posture."""
+  data, rng = mujoco.MjData(scene.model), np.random.default_rng(0)
+  names = {field.name for field in dataclasses.fields(Kinematics)} - {"fields"}
+  worlds = []
+  for _ in range(batch):
+    mujoco.mj_resetData(scene.model, data)
     data.qpos[:6] = [0.0, -1.2, 1.9, -2.2, -1.57, 0.0] + rng.normal(size=6) * 0.2
-    mujoco.mj_forward(model, data)
-    arrays = (data.geom_xpos, data.geom_xmat, data.cam_xpos, data.cam_xmat)
-    batch.append([a.copy() for a in arrays])
-  shapes = ((-1, 3), (-1, 3, 3), (-1, 3), (-1, 3, 3))
-  return [
-    jnp.asarray(np.stack(a).reshape(size, *shape), jnp.float32)
-    for a, shape in zip(zip(*batch, strict=True), shapes, strict=True)
-  ]
+    mujoco.mj_forward(scene.model, data)
+    worlds.append({name: np.array(getattr(data, name), np.float32) for name in names})
+  poses = {}
+  for name in names:
+    tail = (3, 3) if name.endswith("mat") else (3,)
+    stacked = np.stack([world[name] for world in worlds])
+    poses[name] = jnp.asarray(stacked.reshape(batch, -1, *tail))
+  return Kinematics(**poses, fields={})
 
 
 if __name__ == "__main__":

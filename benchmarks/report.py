@@ -25,7 +25,9 @@ import tables
 SECTIONS: dict[str, Callable[[sections.Report], str]] = {
   "fidelity": sections.fidelity,
   "render": sections.render,
+  "ray_layouts": sections.ray_layouts,
   "learner": sections.learner,
+  "encoder_layouts": sections.encoder_layouts,
   "env_steps": sections.env_steps,
   "end_to_end": sections.end_to_end,
   "compile_time": sections.compile_time,

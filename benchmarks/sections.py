@@ -58,13 +58,30 @@ def fidelity(report: Report) -> str:
 
 def render(report: Report) -> str:
   """Pairs of images per second."""
-  head = ("renderer", "batch", "images", "pairs/s", "limit", "reached")
+  head = ("renderer", "batch", "images", "shadow", "pairs/s", "limit", "reached")
   rows = []
   for result in report["results"]:
     sizes = report["resolutions"][result["resolution"]].values()
     images = " + ".join(f"{height}x{width}" for height, width in sizes)
-    label = (RENDERERS[result["renderer"]], result.get("batch", 1), images)
+    shadow = "of the hand" if result.get("shadow") else ""
+    label = (RENDERERS[result["renderer"]], result.get("batch", 1), images, shadow)
     rows.append((*label, *rate(result, "pairs")))
+  return f"{report['scene']}. {note(report)}\n\n{table(head, rows)}"
+
+
+def ray_layouts(report: Report) -> str:
+  """Pairs of images per second by the layout of the ray caster's work."""
+  head = ("layout", "batch", "pairs/s", "compilation, s", "pixels as in use")
+  rows = [
+    (
+      result["layout"],
+      result["batch"],
+      spread(result, "pairs_per_s"),
+      result["compile_s"],
+      f"{100 * result['agreeing']:.2f} %",
+    )
+    for result in report["results"]
+  ]
   return f"{report['scene']}. {note(report)}\n\n{table(head, rows)}"
 
 
@@ -89,6 +106,19 @@ def learner(report: Report) -> str:
     gain = once["updates_per_s"] / again["updates_per_s"]
     rows.append((*setting, *rate(once, "updates"), rate(again, "updates")[0], gain))
   return f"{report['preset']}. {note(report)}\n\n{table(head, rows)}"
+
+
+def encoder_layouts(report: Report) -> str:
+  """Updates per second by the layout of the encoder, and the share of the images."""
+  rates = {result["layout"]: result["updates_per_s"] for result in report["results"]}
+  blind = rates.get("none")
+  head = ("encoder", "updates/s", "limit", "reached", "share of the images")
+  rows = []
+  for result in report["results"]:
+    share = percent(1.0 - result["updates_per_s"] / blind) if blind else ""
+    rows.append((result["layout"], *rate(result, "updates"), share))
+  about = f"{report['preset']}, batch {report['batch']}."
+  return f"{about} {note(report)}\n\n{table(head, rows)}"
 
 
 def env_steps(report: Report) -> str:

@@ -9,7 +9,7 @@ with the lowest and the highest.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 import dataclasses
 import json
 import statistics
@@ -76,14 +76,21 @@ class Carried:
     return self.carry, out
 
 
-def compiled(jitted: Any, *args: Any) -> tuple[Any, float]:
+def compiled(
+  jitted: Any, *args: Any, options: Mapping[str, Any] | None = None
+) -> tuple[Any, float]:
   """What a jitted function compiles to for these arguments, and the seconds it took.
+
+  Args:
+    jitted: the function.
+    args: its arguments.
+    options: of XLA, on top of its own.
 
   Raises:
     ConfigError: it would need more memory than there is.
   """
   began = time.perf_counter()
-  program = jitted.lower(*args).compile()
+  program = jitted.lower(*args).compile(compiler_options=options)
   seconds = time.perf_counter() - began
   if (sizes := program.memory_analysis()) is not None:
     new = sizes.output_size_in_bytes - sizes.alias_size_in_bytes

@@ -67,8 +67,11 @@ SLOW = pytest.mark.slow
   ("script", "args"),
   [
     ("render", ["--alone"]),
+    ("encoder_layouts", ["--layouts", "none", "4x4 / 4, 3x3 / 2 by XLA"]),
     ("env_steps", ["--obs", "state"]),
     ("growth", ["--axes", "candidates", "slots"]),
+    pytest.param("ray_layouts", [], marks=SLOW),
+    pytest.param("encoder_layouts", [], marks=SLOW),
     pytest.param("learner", [], marks=SLOW),
     pytest.param("learner", ["--lstm-instants", "2"], marks=SLOW),
     pytest.param("env_steps", [], marks=SLOW),
@@ -95,6 +98,15 @@ def test_a_benchmark_reports_what_can_be(script, args):
   assert spreads
   # What a script reports, the document can be made of.
   assert "| --- |" in report.SECTIONS[script](found)
+
+
+def test_other_layouts_draw_the_same():
+  same = ["fold, 16 blocks", "types at once", "one by one, in sight"]
+  found = run("ray_layouts", "--layouts", *same)
+  assert [result["layout"] for result in found["results"]] == same
+  for result in found["results"]:
+    assert result["agreeing"] > 0.999
+  assert "| types at once | 2 | " in report.SECTIONS["ray_layouts"](found)
 
 
 def test_operations_are_counted_as_often_as_loops_turn():
@@ -204,7 +216,7 @@ def test_the_document_is_made_of_what_is_at_hand(tmp_path):
   report.write(tmp_path, doc)
   text = doc.read_text()
   assert text.count("as before") == len(report.SECTIONS) - len(reports)
-  assert "| PyBullet, TinyRenderer | 1 | 72x96 | missing: no module |  |  |" in text
+  assert "| PyBullet, TinyRenderer | 1 | 72x96 |  | missing: no module |  |  |" in text
   assert "| t | mjx | pixels | 4 | 50 (40 to 60) | 1,000 | 5 % |" in text
   assert "| 60 % | 40 % |" in text
   assert "2 GFLOP/s and 1 GB/s" in text

@@ -26,6 +26,7 @@ from apnpql_jax.config import (
   replay_bytes,
   validate,
 )
+from apnpql_jax.randomization import ranges
 
 POSITIVE = st.floats(1e-6, 1e6, allow_nan=False)
 
@@ -35,7 +36,9 @@ LATER = {
   "env.shadows": False,
   "env.randomize": False,
   "env.randomization": RandomizationConfig(),
+  "env.randomization.shape": 0.0,
   "agent.residual_blocks": 0,
+  "agent.lstm_instants": 0,
   "agent.global_features": "map",
   "agent.wrist_features": "map",
   "agent.image_shift": 0,
@@ -43,7 +46,7 @@ LATER = {
   "replay.demonstrations": "",
 }
 """What runs did before these settings came. No value may ever change here: if a default
-does, ``codec.added`` has to be given both."""
+does, ``codec.added`` has to be told."""
 
 
 def changed(path: str, value: object) -> TrainConfig:
@@ -78,8 +81,9 @@ def test_defaults_and_presets_are_valid():
 
 
 def test_every_field_has_a_docstring():
-  tree = ast.parse(inspect.getsource(config_module))
-  classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
+  sources = [inspect.getsource(module) for module in (ranges, config_module)]
+  nodes = [node for source in sources for node in ast.parse(source).body]
+  classes = [node for node in nodes if isinstance(node, ast.ClassDef)]
   fields = 0
   for cls in classes:
     for node, after in zip(cls.body, [*cls.body[1:], None], strict=True):

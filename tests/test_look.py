@@ -19,7 +19,7 @@ def _model(*, turn: float = 0.0) -> mujoco.MjModel:
   xml = f"""
 <mujoco><worldbody>
   <light directional="true" dir="{0.4 - turn} -0.2 -1"/>
-  <geom type="plane" size="0 0 0.1" rgba="0.8 {0.8 - turn} 0.7 1"/>
+  <geom type="plane" size="0.5 0.4 0.1" rgba="0.8 {0.8 - turn} 0.7 1"/>
   <geom type="box" size="0.1 {0.12 + 0.2 * turn} 0.05" pos="0 0.2 0.1" euler="20 10 30"
     rgba="0.2 {0.3 + turn} 0.9 1"/>
   <geom type="cylinder" size="0.08 0.1" pos="0.2 -0.2 0.15" euler="40 0 0"
@@ -104,45 +104,52 @@ def test_worlds_have_looks_of_their_own():
 
 
 def _local_points(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-  """Geom ids [H, W], points in the geoms' own frames [H, W, 3], by MuJoCo's rays."""
+  """Geom ids [H, W], points in the geoms' own frames [H, W, 3], by MuJoCo's rays; where
+  nothing is hit the direction of the ray, a unit vector of the world."""
   data = mujoco.MjData(model)
   mujoco.mj_forward(model, data)
   rays = render_oracles.ray_directions(HEIGHT, WIDTH, model.cam_fovy[0])
   ids, depth, _ = render_oracles.cast_rays(model, data, "eye", HEIGHT, WIDTH)
-  steps = (depth / -rays[..., 2])[..., None] * (rays @ data.cam_xmat[0].reshape(3, 3).T)
-  points = data.cam_xpos[0] + np.where(np.isfinite(steps), steps, 0.0)
-  mats = data.geom_xmat.reshape(-1, 3, 3)[ids]
-  return ids, np.einsum("hwji,hwj->hwi", mats, points - data.geom_xpos[ids])
+  ahead = rays @ data.cam_xmat[0].reshape(3, 3).T
+  length = np.where(ids >= 0, depth / -rays[..., 2], 1.0)
+  start = np.where((ids >= 0)[..., None], data.cam_xpos[0] - data.geom_xpos[ids], 0.0)
+  points = start + length[..., None] * ahead
+  mats = np.concatenate([data.geom_xmat.reshape(-1, 3, 3), np.eye(3)[None]])[ids]
+  return ids, np.einsum("hwji,hwj->hwi", mats, points)
 
 
 def test_textures_follow_from_where_a_ray_hits():
-  """Two geoms with checkers, two with noise; colours and heights of waves by NumPy."""
+  """Two geoms with checkers, two and the background with noise, by NumPy."""
   model, rng = _model(), np.random.default_rng(0)
-  waves = np.zeros((4, 3, 4))
-  waves[..., 3] = rng.random((4, 3))
+  waves = np.zeros((5, 3, 4))
+  waves[..., 3] = rng.random((5, 3))
   waves[:2, :, :3] = np.eye(3) / [[[0.22]], [[0.09]]]
   waves[0, 2, :3] = 0.0
-  waves[2:, :, :3] = rng.normal(size=(2, 3, 3)) * 8
-  odd = np.array([[0.1, 0.2, 0.3], [1, 1, 0], [0.9, 0.3, 0.1], [0.1, 0.8, 0.2]])
-  grain = np.array([0.0, 0.0, 0.5, 0.8])
-  fields = {"geom_waves": waves, "geom_odd_rgb": odd, "geom_grain": grain}
+  waves[2:, :, :3] = rng.normal(size=(3, 3, 3)) * 8
+  odd = np.array(
+    [[0.1, 0.2, 0.3], [1, 1, 0], [0.9, 0.3, 0.1], [0.1, 0.8, 0.2], [0.9, 0.9, 0.1]]
+  )
+  grain = np.array([0.0, 0.0, 0.5, 0.8, 0.6])
+  fields = {"waves": waves, "odd_rgb": odd, "grain": grain}
   fields = {name: jnp.asarray(value, jnp.float32) for name, value in fields.items()}
   plain, image = _look(model), _look(model, fields)
   np.testing.assert_array_equal(plain.segmentation, image.segmentation)
   np.testing.assert_array_equal(plain.depth, image.depth)
 
   ids, points = _local_points(model)
-  seen = (ids >= 0) & (ids == np.asarray(image.segmentation))
+  same = ids == np.asarray(image.segmentation)
   turns = np.einsum("hwij,hwj->hwi", waves[ids, :, :3], points) + waves[ids, :, 3]
   is_odd = np.floor(2 * turns).sum(-1) % 2 == 1
-  factor = np.asarray(plain.rgb) / 256 / model.geom_rgba[ids, :3]  # brightness alone
-  color = np.where(is_odd[..., None], odd[ids], model.geom_rgba[ids, :3])
+  colors = np.concatenate([model.geom_rgba[:, :3], [[0.5, 0.6, 0.7]]])
+  factor = np.asarray(plain.rgb) / 256 / colors[ids]  # brightness alone
+  color = np.where(is_odd[..., None], odd[ids], colors[ids])
   slope = np.abs(2 * (turns % 1) - 1)
   noise = (slope**2 * (3 - 2 * slope)).mean(-1)
   dim = 1 - grain[ids] * noise
   expected = 256 * color * factor.mean(-1, keepdims=True) * dim[..., None]
-  error = np.abs(np.asarray(image.rgb) - expected).max(-1)[seen]
+  error = np.abs(np.asarray(image.rgb) - expected).max(-1)[same]
   assert (error < 6).mean() > 0.99  # A pixel on the edge of a square may be either.
-  for geom in range(4):
+  for geom in range(-1, 4):
     assert (ids == geom).sum() > 30
   assert 0.2 < is_odd[ids == 0].mean() < 0.8 and np.ptp(noise[ids == 3]) > 0.3
+  assert 0.2 < is_odd[ids == -1].mean() < 0.8

@@ -15,7 +15,8 @@ import tiny
 
 from apnpql_jax.config import EnvConfig, RandomizationConfig
 from apnpql_jax.env import Env, make_env
-from apnpql_jax.randomization import make_randomize
+from apnpql_jax.randomization.draw import free_bodies
+from apnpql_jax.randomization.worlds import make_randomize
 from apnpql_jax.rollout import expert_policy, rollout
 from apnpql_jax.sim import arm, physics
 from apnpql_jax.sim.kinematics import make_kinematics
@@ -28,9 +29,20 @@ NONE = RandomizationConfig(
 )
 CONFIG = EnvConfig(obs="state", backend="native", bank_rows=256, time_limit_s=0.45)
 
+SIZES = {
+  "geom_size",
+  "geom_pos",
+  "geom_aabb",
+  "geom_rbound",
+  "body_ipos",
+  "body_inertia",
+  "body_invweight0",
+  "dof_M0",
+  "dof_invweight0",
+}
 CHANGES = {
   "color": {"geom_rgba", "background"},
-  "texture": {"geom_waves", "geom_odd_rgb", "geom_grain"},
+  "texture": {"waves", "odd_rgb", "grain"},
   "light_turn": {"light_dir"},
   "light_level": {"light_ambient", "light_diffuse"},
   "camera_shift": {"cam_pos"},
@@ -39,17 +51,8 @@ CHANGES = {
   "table_height": {"body_pos"},
   "table_tilt": {"body_quat"},
   "table_turn": {"body_quat"},
-  "size": {
-    "geom_size",
-    "geom_pos",
-    "geom_aabb",
-    "geom_rbound",
-    "body_ipos",
-    "body_inertia",
-    "body_invweight0",
-    "dof_M0",
-    "dof_invweight0",
-  },
+  "size": SIZES,
+  "shape": SIZES,
   "mass": {
     "body_mass",
     "body_subtreemass",
@@ -78,6 +81,10 @@ def _randomized(task, config=ALL, *, seed: int = 0) -> physics.PhysicsState:
 @pytest.fixture(scope="module")
 def drawn(task) -> physics.PhysicsState:
   return _randomized(task)
+
+
+def _kinematics(task):
+  return jax.jit(make_kinematics(task.scene), compiler_options=tiny.FAST_COMPILE)
 
 
 def _bits(tree) -> list[bytes]:
@@ -109,12 +116,13 @@ def test_a_setting_does_not_change_what_the_others_draw(task, drawn):
   )
   for field in ("geom_rgba", "cam_pos", "light_dir", "body_quat", "geom_size"):
     np.testing.assert_array_equal(fewer.fields[field], drawn.fields[field])
-  assert "geom_waves" not in fewer.fields and "body_mass" not in fewer.fields
+  assert "waves" not in fewer.fields and "body_mass" not in fewer.fields
 
 
 def test_what_is_drawn_fills_its_range_and_differs_between_worlds(task, drawn):
   model, fields = task.scene.model, {k: np.asarray(v) for k, v in drawn.fields.items()}
   body, table = model.body("plate").id, model.geom("table").id
+  plate = model.geom("plate_floor").id
   ratios = {
     "mass": fields["body_mass"][:, body] / model.body_mass[body],
     "friction": fields["pair_friction"][:, 3, 0] / model.pair_friction[3, 0],
@@ -122,6 +130,8 @@ def test_what_is_drawn_fills_its_range_and_differs_between_worlds(task, drawn):
     "field_of_view": fields["cam_fovy"][:, 0] / model.cam_fovy[0],
     "color": 1 + fields["geom_rgba"][:, table, 1] - model.geom_rgba[table, 1],
     "table_height": 1 + fields["body_pos"][:, 1, 2] - model.body_pos[1, 2],
+    "shape": np.divide(*fields["geom_size"][:, plate, 1::-1].T)
+    / np.divide(*model.geom_size[plate, 1::-1]),
   }
   for name, ratio in ratios.items():
     assert np.abs(ratio - 1).max() <= getattr(ALL, name) * 1.001, name
@@ -142,18 +152,40 @@ def test_geoms_of_the_robot_change_their_colour_together(task, drawn):
   np.testing.assert_array_equal(change[:, 3], 0.0)
 
 
-@pytest.mark.parametrize("name", task_names())
-def test_derived_constants_are_those_of_mujoco(name):
-  task = make_task(name)
-  state = _randomized(task, seed=1)
+@pytest.fixture(scope="module", params=task_names())
+def any_task(request):
+  """A task, and worlds of it."""
+  task = make_task(request.param)
+  return task, _randomized(task, seed=1)
+
+
+def _model(task, state: physics.PhysicsState, world: int) -> mujoco.MjModel:
+  """That of one world, without what MuJoCo derives."""
+  model = copy.copy(task.scene.model)
   given = (
-    "body_mass body_inertia body_ipos body_pos body_quat geom_size geom_pos dof_damping"
-  ).split()
+    "body_mass body_inertia body_ipos body_pos body_quat geom_size geom_pos "
+    "dof_damping cam_pos cam_quat"
+  )
+  for field in given.split():
+    getattr(model, field)[:] = np.asarray(state.fields[field][world])
+  return model
+
+
+def _data(model: mujoco.MjModel, state: physics.PhysicsState, world: int):
+  """Poses of one world, by C MuJoCo."""
+  data = mujoco.MjData(model)
+  for name in ("qpos", "mocap_pos", "mocap_quat"):
+    getattr(data, name)[:] = np.asarray(getattr(state, name)[world])
+  mujoco.mj_kinematics(model, data)
+  mujoco.mj_camlight(model, data)
+  return data
+
+
+def test_derived_constants_are_those_of_mujoco(any_task):
+  task, state = any_task
   derived = "body_subtreemass body_invweight0 dof_invweight0 dof_M0".split()
   for world in range(2):
-    model = copy.copy(task.scene.model)
-    for field in given:
-      getattr(model, field)[:] = np.asarray(state.fields[field][world])
+    model = _model(task, state, world)
     mujoco.mj_setConst(model, mujoco.MjData(model))
     for field in derived:
       np.testing.assert_allclose(
@@ -161,17 +193,35 @@ def test_derived_constants_are_those_of_mujoco(name):
       )
 
 
-def test_objects_of_any_size_stand_on_the_table():
-  task = make_task("stack_box")
-  state = _randomized(task)
-  address, _ = task.scene.free_joint("yellow")
-  half = state.fields["geom_size"][:, task.scene.id("geom", "yellow"), 2]
-  np.testing.assert_allclose(state.qpos[:, address + 2], half, rtol=1e-5)
-  assert np.ptp(half) > 0.001
+def test_objects_of_any_size_and_shape_stand_on_the_table(any_task):
+  task, state = any_task
+  sizes = np.asarray(state.fields["geom_size"])
+  for world in range(WORLDS):
+    model = _model(task, state, world)
+    data, table = _data(model, state, world), model.geom("table").id
+    solid = np.union1d(model.pair_geom1, model.pair_geom2)
+    for body in np.flatnonzero(free_bodies(model)):
+      geoms = solid[model.geom_bodyid[solid] == body]
+      gaps = [mujoco.mj_geomDistance(model, data, table, g, 1.0, None) for g in geoms]
+      assert abs(min(gaps)) < 1e-5
+      assert np.ptp(sizes[:, geoms], axis=0).max() > 0.0003
+
+
+def test_what_is_seen_stands_where_c_mujoco_has_it(task, drawn):
+  """Cameras, robot and objects of randomised worlds."""
+  seen = _kinematics(task)(drawn)
+  for world in range(WORLDS):
+    data = _data(_model(task, drawn, world), drawn, world)
+    for name in ("geom_xpos", "cam_xpos", "site_xpos", "geom_xmat", "cam_xmat"):
+      expected = getattr(data, name)
+      found = np.asarray(getattr(seen, name)[world]).reshape(expected.shape)
+      np.testing.assert_allclose(found, expected, atol=1e-5, err_msg=name)
+  camera = np.asarray(seen.cam_xpos)[:, task.scene.id("camera", "global")]
+  assert np.ptp(camera, axis=0).min() > 0.5 * ALL.camera_shift
 
 
 def test_the_arm_stands_where_the_world_has_it(task, drawn):
-  kinematics = jax.jit(make_kinematics(task.scene))(drawn)
+  kinematics = _kinematics(task)(drawn)
   chain = arm.make_chain(task.scene)
   joints = drawn.qpos[:, None, task.scene.arm_qpos]
   moved = arm.with_base(chain, task.scene, drawn.fields)
@@ -238,10 +288,12 @@ def _episodes(env: Env):
 
 
 def test_with_all_ranges_zero_it_is_as_if_it_were_not_there(plain_env):
-  config = dataclasses.replace(CONFIG, randomize=True, randomization=NONE)
+  plain = dataclasses.replace(
+    CONFIG, obs="pixels", global_size=(12, 16), wrist_size=(8, 12)
+  )
+  config = dataclasses.replace(plain, randomize=True, randomization=NONE)
   off, zero = (
-    _episodes(plain_env),
-    _episodes(Env(config, plain_env.task, plain_env._bank)),
+    _episodes(Env(one, plain_env.task, plain_env._bank)) for one in (plain, config)
   )
   assert jax.tree.structure(off) == jax.tree.structure(zero)
   assert _bits(off) == _bits(zero)

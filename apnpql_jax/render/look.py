@@ -22,23 +22,24 @@ Array = jax.Array
 FIELDS = (
   "geom_size",  # f32[*b, ngeom, 3]: MuJoCo half sizes, m
   "geom_rgba",  # f32[*b, ngeom, 4]: of which alpha does not count
-  "geom_waves",  # f32[*b, ngeom, 3, 4]: see ``texture``; with them the next two
-  "geom_odd_rgb",  # f32[*b, ngeom, 3]: the other colour
-  "geom_grain",  # f32[*b, ngeom]: share of the brightness that noise takes at most
+  "waves",  # f32[*b, ngeom + 1, 3, 4]: see ``texture``; with them the next two
+  "odd_rgb",  # f32[*b, ngeom + 1, 3]: the other colour
+  "grain",  # f32[*b, ngeom + 1]: share of the brightness that noise takes at most
   "light_dir",  # f32[*b, nlight, 3]: in which a light travels, of any length
   "light_ambient",  # f32[*b, nlight, 3]: intensity in the dark; the first of the three
   "light_diffuse",  # f32[*b, nlight, 3]: intensity straight below; the first, too
   "cam_fovy",  # f32[*b, ncam]: vertical field of view, degrees
   "background",  # f32[*b, 3]: colour of rays that hit nothing
 )
-"""What may differ between worlds, by MuJoCo's names and by MuJoCo's ids."""
+"""What may differ between worlds, by MuJoCo's names and by MuJoCo's ids; where there is
+one more than geoms, the last is the background."""
 
 
 class Look(NamedTuple):
   """One world; NumPy where it is the same in all."""
 
   sizes: Array | np.ndarray  # f32[n, 3]: of the n geoms that are drawn, m
-  palette: Array | np.ndarray  # f32[2 n + 1, 3]: geoms, their odd squares, background
+  palette: Array | np.ndarray  # f32[2 n + 2, 3]: geoms, background, their odd colours
   texture: Texture | None  # None: as in the scene file
   light: Array | np.ndarray  # f32[3, 3]: see ``shadow.light_basis``
   ambient: Array | float
@@ -58,15 +59,17 @@ def make_look(
     fields: some of ``FIELDS``, without leading axes.
   """
   ids, light = geoms.ids, lighting.id
-  colors, odd, texture = geoms.colors, geoms.checker_colors, None
+  colors, texture = geoms.colors, None
   if "geom_rgba" in fields:
     colors = fields["geom_rgba"][ids, :3]
-  if "geom_waves" in fields:
-    texture = Texture(fields["geom_waves"][ids], fields["geom_grain"][ids])
-    odd = fields["geom_odd_rgb"][ids]
   background = np.array([lighting.background], np.float32)
   if "background" in fields:
     background = fields["background"][None]
+  odd = _join(geoms.checker_colors, background)
+  if "waves" in fields:
+    things = np.append(ids, -1)
+    texture = Texture(fields["waves"][things], fields["grain"][things])
+    odd = fields["odd_rgb"][things]
   basis, ambient, diffuse = None, lighting.ambient, lighting.diffuse
   if "light_dir" in fields:
     basis = light_basis(fields["light_dir"][light], jnp)
@@ -76,7 +79,7 @@ def make_look(
     diffuse = fields["light_diffuse"][light, 0]
   return Look(
     sizes=fields["geom_size"][ids] if "geom_size" in fields else geoms.sizes,
-    palette=_join(colors, odd, background),
+    palette=_join(colors, background, odd),
     texture=texture,
     light=light_basis(lighting.direction) if basis is None else basis,
     ambient=ambient,

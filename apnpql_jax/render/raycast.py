@@ -131,7 +131,7 @@ def _render_one(
   if "rgb" in outputs or "segmentation" in outputs:
     paint = jax.lax.map(lambda rays: cast(rays)[1], blocks)
     if look.texture is not None:
-      draw = functools.partial(texture.textured, frames, look.texture)
+      draw = functools.partial(texture.textured, frames, look.texture, cam_xmat)
       paint = jax.lax.map(lambda seen: draw(*seen), (blocks, t, paint))
   depth = t if "depth" in outputs else None
   return _develop(geoms, camera, look.palette, outputs, depth, paint)
@@ -171,7 +171,7 @@ def _develop(
       rgb = jnp.take(colors, entry, axis=0, mode="clip") * (paint - index)[:, None]
       rgb = rgb.astype(jnp.uint8).reshape(*shape, 3)
     if "segmentation" in outputs:
-      ids = np.concatenate([geoms.ids, geoms.ids, np.array([-1], np.int32)])
+      ids = np.tile(np.append(geoms.ids, np.int32(-1)), 2)
       segmentation = jnp.take(ids, entry, mode="clip").reshape(shape)
   return Image(rgb=rgb, depth=depth, segmentation=segmentation)
 
@@ -193,7 +193,7 @@ def _cast(
   """
   ray_light = intersect.along(basis[2], rays)
   t = jnp.full(rays.u.shape, intersect.MISS, jnp.float32)
-  paint = jnp.full(rays.u.shape, 2 * len(geoms.ids) + _FULL, jnp.float32)
+  paint = jnp.full(rays.u.shape, nothing(geoms), jnp.float32)
   for k, kind in enumerate(geoms.types.tolist()):
     geom = intersect.row(frames, k)
     t_k, cosine = intersect.HITS[kind](geom, rays, ray_light)
@@ -201,13 +201,18 @@ def _cast(
     if look.texture is None and geoms.checker[k] > 0.0:
       edge = float(geoms.checker[k])
       x, y = intersect.plane_point(geom, rays, t_k)
-      index = index + len(geoms.ids) * texture.odd_square(x / edge, y / edge)
+      index = index + (len(geoms.ids) + 1) * texture.odd_square(x / edge, y / edge)
     closer = (t_k < t) & (t_k > near)
     t = jnp.where(closer, t_k, t)
     paint = jnp.where(closer, index + _intensity(lighting, look, cosine), paint)
   if lighting.shadow_casters:
     paint = _darken(geoms, lighting, look, frames, basis, rays, t, paint)
   return t, paint
+
+
+def nothing(geoms: Geoms) -> float:
+  """Paint of rays that hit none of the geoms."""
+  return len(geoms.ids) + _FULL
 
 
 def _intensity(lighting: Lighting, look: Look, cosine: Array) -> Array:
@@ -234,6 +239,6 @@ def _darken(
   for k in geoms.rows(lighting.shadow_receivers, intersect.HITS):
     receives = receives | (index == float(k))
     if geoms.checker[k] > 0.0:
-      receives = receives | (index == float(k + len(geoms.ids)))
+      receives = receives | (index == float(k + len(geoms.ids) + 1))
   dimmed = index + (1.0 - lighting.shadow) * (paint - index)
   return jnp.where(dark & receives, dimmed, paint)

@@ -124,9 +124,9 @@ OWN_FIELDS = (
   "gripper_speed",  # f32[]: in place of GRIPPER_SPEED, m/s
   "control_delay",  # f32[]: whole physics steps until a command takes effect
   "background",  # f32[3]: see ``render.look``, like the rest
-  "geom_waves",  # f32[ngeom, 3, 4]
-  "geom_odd_rgb",  # f32[ngeom, 3]
-  "geom_grain",  # f32[ngeom]
+  "waves",  # f32[ngeom + 1, 3, 4]
+  "odd_rgb",  # f32[ngeom + 1, 3]
+  "grain",  # f32[ngeom + 1]
 )
 """Names in ``PhysicsState.fields`` that are not fields of MuJoCo's model."""
 

@@ -1,0 +1,1 @@
+"""Domain randomisation: every episode has a world of its own (paper Sec. V-C)."""
