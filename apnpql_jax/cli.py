@@ -44,10 +44,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         write(_to_json(result) if parsed.json else show(result))
     return 0
   except ConfigError as error:
-    print("apnpql: " + " ".join(str(error).split()), file=sys.stderr)
+    _complain(" ".join(str(error).split()))
     return 2
   except runs.RunStopped as stop:
-    print(f"apnpql: {stop}", file=sys.stderr, flush=True)
+    _complain(str(stop))
     if stop.code == runs.FAILED:
       # Threads of a save that failed half-way may wait for each other for minutes.
       os._exit(stop.code)
@@ -57,6 +57,12 @@ def main(argv: Sequence[str] | None = None) -> int:
   except BrokenPipeError:  # The reader of our output left, as `head` does.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     return 0
+
+
+def _complain(line: str) -> None:
+  # Standard error may lie on the disk that is full; the exit code tells nevertheless.
+  with contextlib.suppress(OSError):
+    print(f"apnpql: {line}", file=sys.stderr, flush=True)
 
 
 def _preset_named(kind: type[Any], args: Sequence[str]) -> Train | None:

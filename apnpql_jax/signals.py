@@ -6,6 +6,7 @@ save is minutes of one: a thread therefore watches for what has to end at once.
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import signal
@@ -78,4 +79,5 @@ class Signals:
 
 def _write(line: str) -> None:
   """Past Python's buffers, whose locks the main thread may hold."""
-  os.write(2, (line + "\n").encode())
+  with contextlib.suppress(OSError):  # It may lie on a disk that is full.
+    os.write(2, (line + "\n").encode())

@@ -80,6 +80,25 @@ def test_a_second_signal_does_not_wait_but_one_sent_twice_is_one():
     assert stopped == "apnpql: stopped at once"
 
 
+STOPPED = """
+from apnpql_jax import cli, options, runs
+
+def stop(*_):
+  raise runs.RunStopped("no space left", runs.FAILED)
+
+cli._COMMANDS["list"] = (options.List, stop, None)
+cli.main(["list"])
+"""
+
+
+def test_the_exit_code_tells_even_where_no_line_can_be_written():
+  with open("/dev/full", "w") as full:  # As standard error on the disk that is full.
+    root = Path(__file__).parents[1]
+    command = [sys.executable, "-c", STOPPED]
+    done = subprocess.run(command, cwd=root, stderr=full, timeout=60)
+  assert done.returncode == 3
+
+
 def test_signals_are_collected_and_given_back(capfd):
   before = signal.getsignal(signal.SIGTERM)
   with Signals("") as signals:
