@@ -58,7 +58,7 @@ def measure_all(
     layout = LAYOUTS[name]
     transitions = random_batch(0, args.batch, pixels=layout.pixels)
     agent = make_agent(dataclasses.replace(config, **layout.settings))
-    parts = {"PATCH": encoder.PATCH} | layout.parts
+    parts: dict[str, Any] = {"PATCH": encoder.PATCH} | layout.parts
     with mock.patch.multiple(encoder, **parts):
       times, compile_s, floor_s = learner.measure(agent, transitions, args.repeats)
     yield {

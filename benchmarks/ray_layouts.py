@@ -11,7 +11,7 @@ nothing else.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 import contextlib
 import copy
 import dataclasses
@@ -90,9 +90,10 @@ class Layout:
   not right: it is the most that could be gained by casting that once per episode."""
 
   @contextlib.contextmanager
-  def traced(self) -> Iterator[None]:
+  def traced(self) -> Generator[None]:
     """What ``pair`` returned must be traced in here."""
-    with mock.patch.multiple(raycast, **{"BLOCKS": raycast.BLOCKS} | self.parts):
+    parts: dict[str, Any] = {"BLOCKS": raycast.BLOCKS} | self.parts
+    with mock.patch.multiple(raycast, **parts):
       yield
 
   def pair(self, scene: Scene) -> Callable[[Kinematics], list[Array]]:
@@ -128,9 +129,10 @@ def cast_by_type(
   ray_light = intersect.along(basis[2], rays)
 
   def hits(kind: int) -> Cast:
-    def one(geom: intersect.Frames) -> list[Array]:
-      hit = intersect.HITS[kind](geom, rays, ray_light)
-      return [jnp.broadcast_to(x, rays.u.shape) for x in hit]
+    def one(geom: intersect.Frames) -> Cast:
+      t, cosine = intersect.HITS[kind](geom, rays, ray_light)
+      shape = rays.u.shape
+      return jnp.broadcast_to(t, shape), jnp.broadcast_to(cosine, shape)
 
     return jax.vmap(one)(jax.tree.map(lambda x: x[geoms.types == kind], frames))
 
@@ -164,8 +166,8 @@ def cast_in_sight(
     closer = t < seen[0]
     return jnp.where(closer, t, seen[0]), jnp.where(closer, paint + k, seen[1])
 
-  nothing = (intersect.MISS, raycast.nothing(geoms))
-  seen = tuple(jnp.full(rays.u.shape, x) for x in nothing)
+  shape = rays.u.shape
+  seen = jnp.full(shape, intersect.MISS), jnp.full(shape, raycast.nothing(geoms))
   for k, kind in enumerate(geoms.types.tolist()):
     in_sight = may_meet(kind, intersect.row(frames, k), rays)
     seen = jax.lax.cond(in_sight, functools.partial(nearer, k), lambda seen: seen, seen)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 import functools
 import math
+from typing import Any
 
 from flax import linen as nn
 import jax.numpy as jnp
@@ -133,7 +134,8 @@ class Encoder(nn.Module):
     if x.shape[-2:-1] != (self.lstm_instants,):
       raise ValueError(f"features {x.shape} are not of {self.lstm_instants} instants")
     cell = nn.OptimizedLSTMCell(self.feature_dim, name="lstm")
-    return nn.RNN(cell, unroll=self.lstm_instants)(x)[..., -1, :]
+    outputs: Any = nn.RNN(cell, unroll=self.lstm_instants)(x)
+    return outputs[..., -1, :]
 
 
 def keypoints(scores: Array) -> Array:
