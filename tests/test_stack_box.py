@@ -210,12 +210,13 @@ def test_a_stack_at_the_tolerance_stands(task, solved, kinematics, rest):
   assert judge(task, rest(state), kinematics).all()
 
 
-@pytest.mark.parametrize(("off", "stands"), [(0.005, True), (0.03, False)])
+@pytest.mark.parametrize(("off", "stands"), [(0.005, True), (0.01, True), (0.03, False)])
 def test_a_dropped_box_counts_when_it_has_landed(
   task, solved, kinematics, rest, off, stands
 ):
-  """From 1 cm above the blue one, and from beyond its edge."""
-  state = moved(task, solved, "yellow", (0.0, off, 0.01))
+  """From 2 cm above the blue one, and from beyond its edge. With 20 iterations of its
+  line search C MuJoCo throws every other box that falls so."""
+  state = moved(task, solved, "yellow", (0.0, off, 0.02))
   assert not judge(task, state, kinematics).any()
   assert (judge(task, rest(state), kinematics) == stands).all()
 
