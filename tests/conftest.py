@@ -62,9 +62,12 @@ def neutral(task: Task) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def rest(task: Task) -> Callable[[physics.PhysicsState], physics.PhysicsState]:
-  """1.2 s of C MuJoCo with the arm at rest and the hand open."""
-  engine = jax.jit(physics.make_physics("native", task.scene, substeps=240).step)
+def rest(
+  request: pytest.FixtureRequest, task: Task
+) -> Callable[[physics.PhysicsState], physics.PhysicsState]:
+  """1.2 s with the arm at rest and the hand open; C MuJoCo unless a test names MJX."""
+  backend = getattr(request, "param", "native")
+  engine = jax.jit(physics.make_physics(backend, task.scene, substeps=240).step)
 
   def step(state: physics.PhysicsState) -> physics.PhysicsState:
     worlds = len(state.qpos)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
@@ -20,6 +21,9 @@ from apnpql_jax.tasks.pinch import finger_angle
 
 WORLDS = 16
 """Batch size of the shared fixtures: one size, one compilation."""
+
+SLOW_MJX = ["native", pytest.param("mjx", marks=pytest.mark.slow)]
+"""Both engines, where MJX takes minutes."""
 
 MOTIONS = [
   (dof, sign * limit * factor, factor < 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hand_made import SLOW_MJX
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -16,7 +17,6 @@ from apnpql_jax.tasks import task_names
 
 WORLDS = 16
 OBJECTS = {"flip_cup": "cup", "place_plate": "plate", "stack_box": "yellow"}
-SLOW_MJX = ["native", pytest.param("mjx", marks=pytest.mark.slow)]
 
 
 @pytest.fixture(scope="module", params=SLOW_MJX)

@@ -19,6 +19,7 @@ import tempfile
 import time
 from typing import Any
 
+from hand_made import SLOW_MJX
 import jax
 import jax.numpy as jnp
 import messages
@@ -52,9 +53,7 @@ ROUNDING = 1e-4
 PATIENCE_S = 600
 
 
-@pytest.mark.parametrize(
-  "backend", ["native", pytest.param("mjx", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("backend", SLOW_MJX)
 def test_four_devices_learn_what_one_learns(backend):
   flags = f"{tiny.XLA_FLAGS} --xla_force_host_platform_device_count={DEVICES}"
   path = os.pathsep.join(map(str, (tiny.ROOT, *sys.path, Path(__file__).parent)))

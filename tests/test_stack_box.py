@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from hand_made import (
   MOTIONS,
+  SLOW_MJX,
   WORLDS,
   apart,
   assert_pairs_are_uniform,
@@ -210,7 +211,10 @@ def test_a_stack_at_the_tolerance_stands(task, solved, kinematics, rest):
   assert judge(task, rest(state), kinematics).all()
 
 
-@pytest.mark.parametrize(("off", "stands"), [(0.005, True), (0.01, True), (0.03, False)])
+@pytest.mark.parametrize("rest", SLOW_MJX, indirect=True, scope="module")
+@pytest.mark.parametrize(
+  ("off", "stands"), [(0.005, True), (0.01, True), (0.03, False)]
+)
 def test_a_dropped_box_counts_when_it_has_landed(
   task, solved, kinematics, rest, off, stands
 ):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hand_made import each_cup, pos, put, segmentation
+from hand_made import SLOW_MJX, each_cup, pos, put, segmentation
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -94,9 +94,7 @@ def test_worlds_change_their_shapes_without_recompilation(state, fall, moved):
   assert fall._cache_size() == 1
 
 
-@pytest.fixture(
-  scope="module", params=["native", pytest.param("mjx", marks=pytest.mark.slow)]
-)
+@pytest.fixture(scope="module", params=SLOW_MJX)
 def env(request) -> Env:
   """With episodes of two periods."""
   return make_env(
