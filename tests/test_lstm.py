@@ -21,7 +21,7 @@ from apnpql_jax.types import Observation, Slot, TimeStep
 
 CONFIG = AgentConfig(
   n_step=1,
-  learning_rate_e=3e-3,
+  learning_rate_e=1e-3,
   hidden=(32,),
   feature_dim=32,
   patch_channels=2,
@@ -58,7 +58,7 @@ def episodes(steps: int = 64, worlds: int = 16) -> Replay:
 
 
 def error_after_learning(instants: int) -> float:
-  """Of the primitives' velocities, rad/s, over the last of 300 updates."""
+  """Of the primitives' velocities, rad/s, over the last of 400 updates."""
   agent = make_agent(dataclasses.replace(CONFIG, lstm_instants=instants))
   ring = episodes()
   draw = functools.partial(
@@ -70,7 +70,7 @@ def error_after_learning(instants: int) -> float:
 
   def learn(key):
     state = agent.init(key, draw(key).observation_tm1)
-    return jax.lax.scan(update, state, jax.random.split(key, 300))[1]
+    return jax.lax.scan(update, state, jax.random.split(key, 400))[1]
 
   metrics = called(learn, jax.random.key(0))
   assert all(np.isfinite(x).all() for x in metrics.values())
