@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 import zipfile
 
-from hypothesis import HealthCheck, given, settings, strategies as st
+from hypothesis import HealthCheck, example, given, settings, strategies as st
 import numpy as np
 import pytest
 
@@ -43,6 +43,7 @@ def test_no_text_is_taken_for_a_configuration(text: str):
 
 
 @settings(max_examples=500, deadline=None)
+@example({"env": {}, "env.randomization.color": 0})
 @given(st.dictionaries(st.sampled_from(FIELDS), JSON | NUMBERS, min_size=1, max_size=3))
 def test_settings_are_refused_or_read_exactly(changes: dict[str, object]):
   data = json.loads(config_to_json(TrainConfig()))
@@ -50,7 +51,7 @@ def test_settings_are_refused_or_read_exactly(changes: dict[str, object]):
     *path, last = name.split(".")
     inside = data
     for part in path:
-      inside = inside[part] if isinstance(inside, dict) else {}
+      inside = inside.get(part) if isinstance(inside, dict) else None
     if isinstance(inside, dict):
       inside[last] = value
   try:
