@@ -4,8 +4,8 @@
   python benchmarks/end_to_end.py --store --backends native --tasks push_plate
 
 The iteration of `apnpql train` with the preset of each task: rollouts with the policy,
-then updates. Only the number of worlds differs; the replays are empty, which costs the
-same. ``--json`` prints one JSON object and nothing else.
+then updates. Only the number of worlds differs; the replays are empty, which costs
+nearly the same. ``--json`` prints one JSON object and nothing else.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 import dataclasses
+import sys
 from typing import Any
 
 import timing  # isort: skip  (before JAX: sets threads and cache)
@@ -22,7 +23,7 @@ import parts
 import settings
 
 from apnpql_jax.agents.learner import Agent, make_agent
-from apnpql_jax.config import TrainConfig
+from apnpql_jax.config import ConfigError, TrainConfig
 from apnpql_jax.env import make_env
 from apnpql_jax.iteration import (
   TrainState,
@@ -44,14 +45,17 @@ def main() -> None:
 
 
 def measure_all(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-  """Figures of every setting, one after the other."""
+  """Figures of every setting for which the memory suffices, one after the other."""
   for names, config in settings.chosen(args):
     config = dataclasses.replace(
       config,
       rollout_length=args.rollout or config.rollout_length,
       updates_per_iteration=args.updates or config.updates_per_iteration,
     )
-    yield names | measure(config, args.repeats)
+    try:
+      yield names | measure(config, args.repeats)
+    except ConfigError as error:
+      print(f"{names}: {error}", file=sys.stderr)
 
 
 def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:

@@ -10,8 +10,10 @@ preset. ``--json`` prints one JSON object and nothing else.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import argparse
+from collections.abc import Callable, Iterator
 import functools
+import sys
 from typing import Any
 
 import timing  # isort: skip  (before JAX: sets threads and cache)
@@ -22,7 +24,7 @@ import parts
 import settings
 
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import TrainConfig
+from apnpql_jax.config import ConfigError, TrainConfig
 from apnpql_jax.env import Env, EnvState, make_env
 from apnpql_jax.rollout import Policy, agent_policy, rollout
 
@@ -32,9 +34,16 @@ def main() -> None:
   parser = timing.parser(__doc__)
   settings.add_flags(parser)
   args = timing.parse(parser)
-  chosen = settings.chosen(args)
-  results = (names | measure(config, args.repeats) for names, config in chosen)
-  timing.publish("env_steps", args, results)
+  timing.publish("env_steps", args, measure_all(args))
+
+
+def measure_all(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+  """Figures of every setting for which the memory suffices, one after the other."""
+  for names, config in settings.chosen(args):
+    try:
+      yield names | measure(config, args.repeats)
+    except ConfigError as error:
+      print(f"{names}: {error}", file=sys.stderr)
 
 
 def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
@@ -44,15 +53,19 @@ def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
   worlds, length = config.env.worlds, config.rollout_length
   state = jax.jit(env.reset)(jnp.arange(worlds) % env.bank_split)
   params = jax.jit(agent.init)(jax.random.key(0), state.seen).params
-  found = parts.measure(env, agent, params, state, repeats=repeats)
   policies: dict[str, Callable[[Any], Policy]] = {
     "env": lambda params: parts.random_policy,
     "env_policy": functools.partial(agent_policy, agent, greedy=False),
   }
-  figures: dict[str, Any] = {}
+  played = {}
   for name, policy in policies.items():
-    times, compile_s = play(env, policy, params, state, length=length, repeats=repeats)
-    times = times.per(length * worlds)
+    run, compile_s = player(env, policy, params, state, length=length)
+    times = timing.measure(run, repeats=repeats).per(length * worlds)
+    played[name], (state, _) = (times, compile_s), run.carry
+  # From where the policy has come to: at the reset nothing moves yet.
+  found = parts.measure(env, agent, params, state, repeats=repeats)
+  figures: dict[str, Any] = {}
+  for name, (times, compile_s) in played.items():
     idle = "networks" if name == "env" else None
     floor_s = sum(part.floor_s for key, part in found.items() if key != idle)
     figures[name] = {
@@ -65,16 +78,15 @@ def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
   return figures | {"shares": parts.shares(period_s, seconds)}
 
 
-def play(
+def player(
   env: Env,
   policy: Callable[[Any], Policy],
   params: Any,
   state: EnvState,
   *,
   length: int,
-  repeats: int,
-) -> tuple[timing.Times, float]:
-  """Times rollouts from ``state`` on; also returns the seconds of compilation."""
+) -> tuple[timing.Carried, float]:
+  """Rollouts from ``state`` on, and the seconds of compilation; carries the state."""
 
   def go_on(carry: Any, params: Any) -> Any:
     state, key = carry
@@ -84,8 +96,7 @@ def play(
 
   carry = (state, jax.random.key(0))
   run, compile_s = timing.compiled(jax.jit(go_on), carry, params)
-  rollouts = timing.Carried(lambda carry: run(carry, params), carry)
-  return timing.measure(rollouts, repeats=repeats), compile_s
+  return timing.Carried(lambda carry: run(carry, params), carry), compile_s
 
 
 if __name__ == "__main__":

@@ -52,12 +52,12 @@ def machine_peak() -> Peak:
   square = jnp.ones((size, size))
   # As large as no cache is, and in place, for fresh memory would cost page faults.
   copied = jnp.ones(length)
-  product = _fastest(jax.jit(lambda x: square @ x / size), jnp.copy(square))
+  product = _fastest(jax.jit(lambda x: square @ x / size), jnp.copy(square), calls=50)
   copy = _fastest(jax.jit(lambda x: x + 1.0, donate_argnums=0), copied)
   return Peak(2 * size**3 / product, 2 * nbytes(copied) / copy)
 
 
-def _fastest(step: Callable[[Any], Any], carry: Any, calls: int = 5) -> float:
+def _fastest(step: Callable[[Any], Any], carry: Any, calls: int = 20) -> float:
   carry = jax.block_until_ready(step(carry))
   fastest = float("inf")
   for _ in range(calls):

@@ -202,13 +202,10 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def store(path: Path) -> None:
-  """Keeps a report in ``benchmarks/results``, and its table in docs/performance.md."""
+  """Keeps a report in ``benchmarks/results``; ``report.py`` makes the table of it."""
   import tables  # Needs what may have to be taken from the wheels elsewhere.
 
-  report = json.loads(path.read_text())
-  tables.store("gpu_suite", report)
-  head = ("section", "figure", "per second", "", "compile s", "GiB", "note")
-  tables.put("gpu", f"Commit {report['commit']}.\n\n{tables.table(head, rows(report))}")
+  tables.store("gpu_suite", json.loads(path.read_text()))
 
 
 def rows(report: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
@@ -316,9 +313,11 @@ def _imports(env: dict[str, str]) -> str | None:
 
 
 def _commit() -> str:
-  done = subprocess.run(
-    ["git", "rev-parse", "--short", "HEAD"], cwd=FOLDER, capture_output=True, text=True
-  )
+  command = ["git", "rev-parse", "--short", "HEAD"]
+  try:
+    done = subprocess.run(command, cwd=FOLDER, capture_output=True, text=True)
+  except OSError:  # No git.
+    return ""
   return done.stdout.strip()
 
 

@@ -49,6 +49,9 @@ BATCH = 64
 WORLDS = 32
 """Where they are not what grows."""
 
+PLAYED = 16
+"""Periods after the reset at which worlds are timed, however many there are."""
+
 Timed = tuple[timing.Times, float]
 """Of one call, and the least seconds that it can take."""
 
@@ -117,7 +120,7 @@ def pixels(config: TrainConfig, args: argparse.Namespace) -> Sizes:
 
 
 def slots(config: TrainConfig, args: argparse.Namespace) -> Sizes:
-  """Adding what a rollout brings, and drawing a batch."""
+  """Adding what a rollout brings, looking what of it to leave out, drawing a batch."""
   for count in args.slots:
     yield "add and draw", count, functools.partial(_replay, config, count)
 
@@ -145,9 +148,10 @@ AXES = {
 def _period(config: EnvConfig, *, repeats: int) -> Timed:
   env = make_env(config)
   state = jax.jit(env.reset)(jnp.arange(config.worlds) % env.bank_split)
-  times, _ = env_steps.play(
-    env, lambda _: parts.random_policy, None, state, length=1, repeats=repeats
-  )
+  run, _ = env_steps.player(env, lambda _: parts.random_policy, None, state, length=1)
+  for _ in range(PLAYED):
+    run()
+  times = timing.measure(run.again, repeats=repeats)
   images = floor.count(functools.partial(parts.draw, env, config), state.physics)
   physics = parts.physics_work(env.physics, state.physics)
   return times, images.seconds() + physics.seconds()
@@ -194,11 +198,12 @@ def _replay(config: TrainConfig, count: int, *, repeats: int) -> Timed:
   memory.check_memory(need, "the replay")
   ring = create(length=length).replace(size=jnp.full((), length))
   chunk = create(length=config.rollout_length).slots
+  none = jnp.zeros(config.env.worlds, jnp.int32)
 
   def step(carry: Any, chunk: Any) -> Any:
     ring, key = carry
     key, draw_key = jax.random.split(key)
-    ring = replay.add(ring, chunk)
+    ring = replay.exclude(replay.add(ring, chunk), none)
     batch = replay.sample(
       ring,
       draw_key,

@@ -8,29 +8,33 @@ missing one may take the interpreter down.
 from __future__ import annotations
 
 from collections.abc import Callable
+import itertools
 import json
 import os
 from pathlib import Path
+import statistics
 import subprocess
 import sys
-import time
 from typing import Any
 
 import mujoco
 import numpy as np
+import sides
 
 STATES = 8
-SECONDS = 3.0
+SECONDS = 1.0
+"""Of work per repeat."""
 
 
 def measure_others(
-  scene: Path, cameras: dict[str, tuple[int, int]]
+  scene: Path, cameras: dict[str, tuple[int, int]], *, repeats: int
 ) -> dict[str, dict[str, Any]]:
   """Pairs per second by renderer, or one line that says why there is no figure.
 
   Args:
     scene: MJCF file.
     cameras: height and width by name.
+    repeats: how often each is timed.
   """
   found = {}
   for name, env in (
@@ -38,7 +42,8 @@ def measure_others(
     ("mujoco_osmesa", {"MUJOCO_GL": "osmesa"}),
     ("pybullet_tiny", {}),
   ):
-    command = [sys.executable, __file__, name, str(scene), json.dumps(cameras)]
+    inputs = (name, str(scene), json.dumps(cameras), str(repeats))
+    command = [sys.executable, __file__, *inputs]
     done = subprocess.run(
       command, env=os.environ | env, capture_output=True, text=True, check=False
     )
@@ -107,6 +112,7 @@ def pybullet_pair(
           model.cam_fovy[model.camera(name).id], width / height, 0.01, 5.0
         ),
         renderer=pybullet.ER_TINY_RENDERER,
+        flags=pybullet.ER_NO_SEGMENTATION_MASK,
       )[2]
       for name, (height, width) in cameras.items()
     ]
@@ -149,17 +155,16 @@ PAIRS = {
 }
 
 
-def main(name: str, scene: str, cameras: str) -> None:
+def main(name: str, scene: str, cameras: str, repeats: str) -> None:
   """Prints the figures of one renderer as JSON."""
   model = mujoco.MjModel.from_xml_path(scene)
   pair, worlds = PAIRS[name](model, json.loads(cameras)), states(model)
   pair(worlds[0])
-  count, began = 0, time.perf_counter()
-  while time.perf_counter() - began < SECONDS:
-    pair(worlds[count % STATES])
-    count += 1
-  seconds = time.perf_counter() - began
-  print(json.dumps({"pairs_per_s": count / seconds}), flush=True)
+  turn = itertools.cycle(worlds)
+  rate = sides.rate_of(lambda: pair(next(turn)), 1)
+  rates = [rate(SECONDS) for _ in range(int(repeats))]
+  figures = {"": statistics.median(rates), "_low": min(rates), "_high": max(rates)}
+  print(json.dumps({f"pairs_per_s{end}": x for end, x in figures.items()}), flush=True)
 
 
 if __name__ == "__main__":

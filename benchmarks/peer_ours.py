@@ -84,8 +84,12 @@ def learner(settings: dict[str, Any]) -> dict[str, sides.Measure]:
 
 
 def learner_config(settings: dict[str, Any]) -> AgentConfig:
-  """The agent of the preset with the algorithm and the candidates asked for."""
+  """The agent of the preset with algorithm, candidates and features as asked for."""
   config = load_preset(settings["preset"]).agent
+  if features := settings.get("features"):
+    config = dataclasses.replace(
+      config, global_features=features, wrist_features=features
+    )
   return dataclasses.replace(
     config,
     algorithm=settings.get("algorithm", config.algorithm),

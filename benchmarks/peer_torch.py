@@ -27,15 +27,17 @@ from apnpql_jax.presets import load_preset
 
 JOINTS, PRIMITIVES = 6, 3
 BELOW = JOINTS * (JOINTS - 1) // 2
+SHARPNESS = 4.0
+"""Of keypoints, as in our encoder."""
 IMAGES = {"global": (72, 96), "wrist": (36, 64)}
 
 Batch = dict[str, torch.Tensor]
 
 
 class Camera(nn.Module):
-  """Two convolutions and the map's own projection."""
+  """Two convolutions, and what is kept of them: the map's own projection, keypoints."""
 
-  def __init__(self, config: AgentConfig, size: tuple[int, int]):
+  def __init__(self, config: AgentConfig, size: tuple[int, int], kept: str):
     super().__init__()
     first, second = config.patch_channels, config.conv_channels
     height, width = (8 * math.ceil(side / 8) for side in size)
@@ -44,12 +46,21 @@ class Camera(nn.Module):
     kernel = 3 if config.conv_overlap else 2
     self.second = nn.Conv2d(first, second, kernel, stride=2, padding=kernel // 3)
     cells = height * width // 64
-    self.project = nn.Linear(cells * second, config.feature_dim, bias=False)
+    self.project = None
+    if kept != "keypoints":
+      self.project = nn.Linear(cells * second, config.feature_dim, bias=False)
+    self.points = 0 if kept == "map" else 2 * (first + second)
 
-  def forward(self, image: torch.Tensor) -> torch.Tensor:
-    """u8[B, 3, H, W] -> f32[B, feature_dim]."""
-    x = F.pad(image.float() / 255.0, self.padding)
-    return self.project(F.relu(self.second(F.relu(self.first(x)))).flatten(1))
+  def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """u8[B, 3, H, W] -> f32[B, feature_dim], zero without a map, and f32[B, points]."""
+    patches = self.first(F.pad(image.float() / 255.0, self.padding))
+    x = self.second(F.relu(patches))
+    seen, points = x.new_zeros(()), x.new_zeros(len(x), 0)
+    if self.project is not None:
+      seen = self.project(F.relu(x).flatten(1))
+    if self.points:
+      points = torch.cat([keypoints(patches), keypoints(x)], -1)
+    return seen, points
 
 
 class Encoder(nn.Module):
@@ -57,9 +68,11 @@ class Encoder(nn.Module):
 
   def __init__(self, config: AgentConfig):
     super().__init__()
-    sizes = IMAGES.items()
-    self.cameras = nn.ModuleDict({name: Camera(config, size) for name, size in sizes})
-    self.state = nn.Linear(33, config.feature_dim)
+    kept = {"global": config.global_features, "wrist": config.wrist_features}
+    cameras = {name: Camera(config, size, kept[name]) for name, size in IMAGES.items()}
+    self.cameras = nn.ModuleDict(cameras)
+    points = sum(camera.points for camera in cameras.values())
+    self.state = nn.Linear(33 + points, config.feature_dim)
     self.from_state = nn.Linear(config.feature_dim, config.feature_dim)
     self.norm = nn.LayerNorm(config.feature_dim)
 
@@ -69,10 +82,10 @@ class Encoder(nn.Module):
     newest, changes = robot[:, -1], 7.0 * (robot[:, 1:] - robot[:, :-1])
     joints = newest[:, :JOINTS]
     state = [newest, joints.sin(), joints.cos(), changes.flatten(1)]
-    x = self.from_state(F.relu(self.state(torch.cat(state, -1))))
-    for name, camera in self.cameras.items():
-      x = x + camera(batch[f"{name}_{time}"])
-    return F.relu(self.norm(x))
+    seen = [camera(batch[f"{name}_{time}"]) for name, camera in self.cameras.items()]
+    maps, points = zip(*seen, strict=True)
+    x = self.from_state(F.relu(self.state(torch.cat([*state, *points], -1))))
+    return F.relu(self.norm(x + sum(maps)))
 
 
 class ValueHead(nn.Module):
@@ -137,12 +150,8 @@ class Networks(nn.Module):
 
   def __init__(self, config: AgentConfig):
     super().__init__()
-    if (config.algorithm, config.global_features, config.wrist_features) != (
-      "ap_npql",
-      "map",
-      "map",
-    ):
-      raise ValueError("only ap_npql with maps of both cameras is written in PyTorch")
+    if config.algorithm != "ap_npql":
+      raise ValueError("only ap_npql is written in PyTorch")
     self.config = config
     widths = [config.feature_dim, *config.hidden]
     self.encoder = Encoder(config)
@@ -250,6 +259,16 @@ class Learner:
     return goal.scatter_add_(-1, index + 1, probs * share)
 
 
+def keypoints(scores: torch.Tensor) -> torch.Tensor:
+  """f32[B, C, H, W] -> f32[B, 2 C]: soft-argmax of each channel, within [-1, 1]."""
+  height, width = scores.shape[-2:]
+  share = F.softmax(SHARPNESS * scores.flatten(2), -1).unflatten(-1, (height, width))
+  rows, columns = (
+    (2 * torch.arange(n, device=scores.device) + 1) / n - 1 for n in (height, width)
+  )
+  return torch.stack([share.sum(-1) @ rows, share.sum(-2) @ columns], -1).flatten(1)
+
+
 def ap_loss(
   predicted: torch.Tensor, label: torch.Tensor, config: AgentConfig
 ) -> torch.Tensor:
@@ -297,7 +316,8 @@ def main(settings: dict[str, Any]) -> None:
   )
   learner, batch = Learner(config, device), random_batch(settings["batch"], device)
   measure = sides.rate_of(lambda: learner.update(batch), 1)
-  sides.serve({"updates": measure}, version=torch.__version__, device=device)
+  about = {"version": torch.__version__, "device": device}
+  sides.serve({"updates": measure}, **about, threads=torch.get_num_threads())
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """This project beside others on the same machine in the same run: ratios.
 
   python benchmarks/peers.py --quick
-  python benchmarks/peers.py --store        # keeps the table in docs/performance.md
+  python benchmarks/peers.py --store
 
 Each peer is set up as its users would, see ``PEERS``, in processes of its own, and so
 is this project. The two are timed in turns, round by round; a ratio is ours over
@@ -102,12 +102,12 @@ PEERS = {
     {"side": "learner", "algorithm": "ap_npql"},
   ),
   "brax": Peer(
-    "Brax's SAC with its vision networks, one jitted update, against our row sac; both "
-    "draw one action",
+    "Brax's SAC with its vision networks, one jitted update, against our row sac with "
+    "maps of both cameras, as Brax has them; both draw one action",
     "peer_brax.py",
     ("updates",),
     # One draw of the arm, summed over both gripper commands.
-    {"side": "learner", "algorithm": "sac", "candidates": 2},
+    {"side": "learner", "algorithm": "sac", "candidates": 2, "features": "map"},
   ),
 }
 
@@ -135,8 +135,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         tables.store("peers", report)
   if args.json:
     print(json.dumps(report))
-  if args.store:
-    write(report)
 
 
 def compare(
@@ -151,13 +149,13 @@ def compare(
       with sides.Side("peer_ours.py", sizes | peer.ours, limit_s=args.limit) as ours:
         about = {k: v for k, v in theirs.about.items() if k != "ready"}
         for rate in peer.rates:
-          found = {"peer": name, "rate": rate, "about": about}
+          found = {"peer": peer.label, "rate": RATES[rate], "about": about}
           try:
             yield found | ratio(ours, theirs, rate, args)
           except sides.SideFailed as error:
             yield found | {"missing": str(error)}
   except sides.SideFailed as error:
-    yield {"peer": name, "missing": str(error)}
+    yield {"peer": peer.label, "missing": str(error)}
 
 
 def ratio(
@@ -191,31 +189,11 @@ def graphics() -> str:
   return "disable"
 
 
-def write(report: dict[str, Any]) -> None:
-  """The table in docs/performance.md."""
-  rows = []
-  for result in report["results"]:
-    label = PEERS[result["peer"]].label
-    what = RATES.get(result.get("rate", ""), "-")
-    if "ratio" in result:
-      spread = f"{result['ratio_low']:.3g} to {result['ratio_high']:.3g}"
-      rows.append((label, what, result["ratio"], spread))
-    else:
-      rows.append((label, what, "-", result["missing"]))
-  note = (
-    f"{report['task']}, {report['device']}, {report['cores']} cores; theirs in "
-    f"{report['processes']} processes, ours with {report['worlds']} worlds; updates of "
-    f"batch {report['batch']} with {report['candidates']} candidates."
-  )
-  head = ("peer", "rate", "ours / theirs", "over rounds")
-  tables.put("peers", f"{note}\n\n{tables.table(head, rows)}")
-
-
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
   parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
   parser.add_argument("--json", action="store_true", help="print one JSON object")
   parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
-  parser.add_argument("--store", action="store_true", help="keep JSON and table")
+  parser.add_argument("--store", action="store_true", help="keep the JSON in results")
   parser.add_argument("--peers", nargs="+", choices=PEERS, default=list(PEERS))
   parser.add_argument("--task", choices=task_names(), default="push_plate")
   parser.add_argument("--preset", choices=preset_names(), default="push_plate")
@@ -225,8 +203,10 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
   parser.add_argument("--candidates", type=int, default=120)
   parser.add_argument("--rounds", type=int, default=5)
   parser.add_argument("--seconds", type=float, default=4.0, help="of work per figure")
-  parser.add_argument("--limit", type=float, default=300.0, help="s for an answer")
+  parser.add_argument("--limit", type=float, default=900.0, help="s for an answer")
   args = parser.parse_args(argv)
+  if args.quick and args.store:
+    parser.error("--quick figures mean nothing; nothing is stored")
   if args.quick:
     args.processes, args.worlds, args.batch, args.candidates = 2, 4, 8, 8
     args.rounds, args.seconds = 1, 0.2

@@ -63,7 +63,9 @@ def measure_all(
 ) -> Iterator[dict[str, Any]]:
   """Figures of every renderer and size, one after the other."""
   for name, sizes in resolutions.items():
-    others = {} if args.alone else measure_others(mjcf_path(SCENE), sizes)
+    others = {}
+    if not args.alone:
+      others = measure_others(mjcf_path(SCENE), sizes, repeats=args.repeats)
     for renderer, found in others.items():
       yield {"resolution": name, "renderer": renderer, **found}
     plain = itertools.product([False], args.batch)

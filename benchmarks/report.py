@@ -32,7 +32,13 @@ SECTIONS: dict[str, Callable[[sections.Report], str]] = {
   "end_to_end": sections.end_to_end,
   "compile_time": sections.compile_time,
   "growth": sections.growth,
+  "peers": sections.peers,
+  "gpu_suite": sections.gpu,
 }
+"""Name of a benchmark -> what is said of its report."""
+
+MEASURED_HERE = [name for name in SECTIONS if name != "gpu_suite"]
+"""The suite has a command line of its own, and needs a GPU."""
 
 COLUMNS = 3
 """Of panels in a plot."""
@@ -41,11 +47,13 @@ COLUMNS = 3
 def main() -> None:
   """Command line; see the module's docstring."""
   parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-  parser.add_argument("--measure", nargs="*", choices=SECTIONS, help="these, or all")
+  parser.add_argument(
+    "--measure", nargs="*", choices=MEASURED_HERE, help="these, or all"
+  )
   args = parser.parse_args()
   failed = []
   if args.measure is not None:
-    failed = [name for name in args.measure or SECTIONS if not measure(name)]
+    failed = [name for name in args.measure or MEASURED_HERE if not measure(name)]
   write()
   if failed:
     sys.exit(f"failed: {', '.join(failed)}")
@@ -59,13 +67,19 @@ def measure(name: str) -> bool:
 
 def write(results: Path = tables.RESULTS, docs: Path = tables.PERFORMANCE) -> None:
   """Puts every report at hand into the document, and draws the plots beside it."""
-  for name, section in SECTIONS.items():
-    path = results / f"{name}.json"
-    if path.exists():
-      report = json.loads(path.read_text())
-      tables.put(name, section(report), docs)
-      if name == "growth":
-        plot_growth(report, docs.parent / "images" / "growth.png")
+  paths = {name: results / f"{name}.json" for name in SECTIONS}
+  found = {
+    k: json.loads(path.read_text()) for k, path in paths.items() if path.exists()
+  }
+  for name, report in found.items():
+    tables.put(name, SECTIONS[name](report), docs)
+  images = docs.parent / "images"
+  images.mkdir(exist_ok=True)
+  if "growth" in found:
+    plot_growth(found["growth"], images / "growth.png")
+  if "env_steps" in found and "end_to_end" in found:
+    rates = sections.rates(found["env_steps"], found["end_to_end"])
+    plot_rates(rates, images / "rates.png")
 
 
 def plot_growth(report: sections.Report, out: Path) -> None:
@@ -90,7 +104,20 @@ def plot_growth(report: sections.Report, out: Path) -> None:
     panel.legend()
   for panel in panels[:, 0]:
     panel.set_ylabel("s")
-  out.parent.mkdir(exist_ok=True)
+  figure.savefig(out, dpi=120)
+
+
+def plot_rates(rates: sections.Rates, out: Path) -> None:
+  """Steps per second by number of worlds, log-log, a panel for each engine."""
+  figure = Figure(figsize=(3.6 * len(rates), 2.8), layout="constrained")
+  panels = figure.subplots(1, len(rates), squeeze=False, sharey=True)[0]
+  for panel, (backend, kinds) in zip(panels, rates.items(), strict=True):
+    for label, points in kinds.items():
+      worlds, steps = zip(*sorted(points.items()), strict=True)
+      panel.loglog(worlds, steps, "o-", label=label)
+    panel.set(title=backend, xlabel="worlds")
+  panels[0].set_ylabel("environment steps/s")
+  panels[0].legend()
   figure.savefig(out, dpi=120)
 
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import gpu_suite
 from tables import number, table
 
 Report = dict[str, Any]
+Rates = dict[str, dict[str, dict[int, float]]]
+"""Steps per second by engine, by what is played or trained, and by worlds."""
 
 RENDERERS = {
   "ray_caster": "ray caster",
@@ -159,7 +162,26 @@ def end_to_end(report: Report) -> str:
     )
     for result in report["results"]
   ]
-  return f"{note(report)}\n\n{table(head, rows)}"
+  plot = "![steps per second by worlds](images/rates.png)"
+  return f"{note(report)}\n\n{table(head, rows)}\n\n{plot}"
+
+
+def rates(env_steps: Report, end_to_end: Report) -> Rates:
+  """Steps per second of the first task by number of worlds."""
+  task = env_steps["results"][0]["task"]
+  found: Rates = {}
+
+  def put(result: dict[str, Any], label: str, steps: float) -> None:
+    if result["task"] == task:
+      curves = found.setdefault(result["backend"], {})
+      curves.setdefault(label, {})[result["worlds"]] = steps
+
+  for result in env_steps["results"]:
+    put(result, "env", result["env"]["steps_per_s"])
+    put(result, "env + policy", result["env_policy"]["steps_per_s"])
+  for result in end_to_end["results"]:
+    put(result, "env + policy + learning", result["steps_per_s"])
+  return found
 
 
 def compile_time(report: Report) -> str:
@@ -188,6 +210,36 @@ def growth(report: Report) -> str:
         rows.setdefault(point["size"], [point["size"]]).extend(_point(last, point))
     tables.append(table(head, rows.values()))
   return "\n\n".join([note(report), "![growth](images/growth.png)", *tables])
+
+
+def peers(report: Report) -> str:
+  """Ratios of this project's rates to those of others."""
+  head = ("peer", "rate", "ours / theirs", "over rounds")
+  rows = [
+    (result["peer"], result.get("rate", "-"), *_ratio(result))
+    for result in report["results"]
+  ]
+  about = (
+    f"{report['task']}, {report['device']}, {report['cores']} cores, commit "
+    f"{report['commit'] or 'unknown'}; theirs in {report['processes']} processes, ours "
+    f"with {report['worlds']} worlds; updates of batch {report['batch']} with "
+    f"{report['candidates']} candidates."
+  )
+  return f"{about}\n\n{table(head, rows)}"
+
+
+def _ratio(result: dict[str, Any]) -> tuple[Any, str]:
+  if "missing" in result:
+    return "-", f"missing: {result['missing']}"
+  return result["ratio"], " to ".join(
+    number(result[f"ratio_{end}"]) for end in ("low", "high")
+  )
+
+
+def gpu(report: Report) -> str:
+  """All that the suite found on a GPU."""
+  head = ("section", "figure", "per second", "", "compile s", "GiB", "note")
+  return f"Commit {report['commit']}.\n\n{table(head, gpu_suite.rows(report))}"
 
 
 def curves(report: Report) -> dict[str, dict[str, list[dict[str, Any]]]]:

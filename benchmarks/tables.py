@@ -3,31 +3,53 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+import contextlib
+from importlib import metadata
 import json
 import os
 from pathlib import Path
+import platform
 import subprocess
 from typing import Any
 
 import jax
-import mujoco
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
+ENGINES = ("mujoco", "mujoco-mjx")
 PERFORMANCE = ROOT / "docs" / "performance.md"
 
 
 def machine() -> dict[str, Any]:
-  """What a figure was measured with; the commit is empty outside a checkout."""
-  commit = subprocess.run(
-    ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True
-  )
+  """What a figure was measured with."""
+  kind = jax.devices()[0].device_kind
+  packages = {name: metadata.version(name) for name in ("jax", "jaxlib", *ENGINES)}
   return {
-    "commit": commit.stdout.strip(),
-    "device": jax.devices()[0].device_kind,
+    "commit": commit(),
+    "device": _processor() if kind == "cpu" else kind,
     "cores": len(os.sched_getaffinity(0)),
-    "versions": {module.__name__: module.__version__ for module in (jax, mujoco)},
+    "versions": {"python": platform.python_version(), **packages},
   }
+
+
+def commit() -> str:
+  """The short name of the commit; empty outside a checkout, or without git."""
+  command = ["git", "rev-parse", "--short", "HEAD"]
+  try:
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+  except OSError:
+    return ""
+  return done.stdout.strip()
+
+
+def _processor() -> str:
+  """Linux's name of the CPU, else Python's."""
+  with contextlib.suppress(OSError):
+    for line in Path("/proc/cpuinfo").read_text().splitlines():
+      name, _, value = line.partition(":")
+      if name.strip() == "model name":
+        return value.strip()
+  return platform.processor() or platform.machine()
 
 
 def store(name: str, report: dict[str, Any]) -> None:

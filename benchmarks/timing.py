@@ -75,6 +75,10 @@ class Carried:
     self.carry, out = self._step(self.carry)
     return self.carry, out
 
+  def again(self) -> Any:
+    """The same step every time, if it donates nothing; returns all of it."""
+    return self._step(self.carry)
+
 
 def compiled(
   jitted: Any, *args: Any, options: Mapping[str, Any] | None = None
@@ -134,6 +138,8 @@ def parser(doc: str | None, *, repeats: int = 5) -> argparse.ArgumentParser:
 def parse(options: argparse.ArgumentParser) -> argparse.Namespace:
   """Reads the command line; whoever is quick repeats twice only."""
   args = options.parse_args()
+  if args.quick and args.store:
+    options.error("--quick figures mean nothing; nothing is stored")
   args.repeats = 2 if args.quick else args.repeats
   return args
 
