@@ -1,123 +1,224 @@
 """The four algorithms of the paper on all tasks from states: curves and a table.
 
-  python experiments/results/state_comparison.py                     # many hours
+  python experiments/results/state_comparison.py --jobs 2            # hours
   python experiments/results/state_comparison.py --tasks push_plate --seeds 0
+  python experiments/results/state_comparison.py --tasks push_plate --seeds 0 \
+      --rows npql_without_ap sac_without_ap
 
 Trains whatever is missing in state_comparison/ beside this file, a JSON per run, with
 equal budgets of environment steps, updates and candidates; then draws curves.png and
-writes table.md from all that is there.
+writes table.md from all that is there. A run can be interrupted; it then starts over.
 """
 
 from __future__ import annotations
 
 import argparse
+from concurrent.futures import ThreadPoolExecutor
 import itertools
 import json
+import os
 from pathlib import Path
 import subprocess
 import sys
 import tempfile
+from typing import Any, NamedTuple
 
 import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from summarize import GOAL, evaluations
+from summarize import GOAL
 
-from apnpql_jax.run_folder import open_run
+from apnpql_jax.metrics import read_rows, wilson_interval
+from apnpql_jax.run_folder import RunFolder, open_run
 
 OUT = Path(__file__).resolve().with_suffix("")
-ALGORITHMS = {
-  "ap_npql": "",
-  "ap_mpo": "",
-  # Reverse KL. From a wider policy, KL to the narrow prior begins at 200 epsilon.
-  "ap_sac": "--agent.epsilon 6 --agent.policy-initial-std 0.05",
-  # A uniform prior: 4.85 - epsilon is the floor on the policy's entropy.
-  "sac": "--agent.epsilon 10",
-}
-"""Name -> settings in which it differs from the preset of the task."""
 
-STEPS = {"push_plate": 30_720, "stack_box": 61_440, "place_plate": 61_440}
-STEPS["flip_cup"] = STEPS["stack_box"]
+
+class Row(NamedTuple):
+  """What is compared."""
+
+  algorithm: str
+  flags: str = ""
+  """In which it differs from the preset of the task."""
+
+  budget: int = 1
+  """Times the environment steps of the others."""
+
+
+ROWS = {
+  "ap_npql": Row("ap_npql"),
+  # Parametric policies start as narrow as the prior is at its widest.
+  "ap_mpo": Row("ap_mpo", "--agent.policy-initial-std 0.05"),
+  # Reverse KL. From a wider policy, KL to the narrow prior begins at 200 epsilon.
+  "ap_sac": Row("ap_sac", "--agent.epsilon 6 --agent.policy-initial-std 0.05"),
+  # A uniform prior: 4.85 - epsilon is the floor on the policy's entropy.
+  "sac": Row("sac", "--agent.epsilon 14"),
+  # Nothing of the primitives, neither as a prior nor as an auxiliary loss.
+  "npql_without_ap": Row(
+    "ap_npql", "--agent.regulariser uniform --agent.lambda-ap 0", budget=10
+  ),
+  "sac_without_ap": Row("sac", "--agent.epsilon 14 --agent.lambda-ap 0", budget=10),
+}
+PAPER = ("ap_npql", "ap_mpo", "ap_sac", "sac")
+
+STEPS = {
+  "push_plate": 30_720,
+  "stack_box": 61_440,
+  "flip_cup": 61_440,
+  "place_plate": 61_440,
+}
 """Environment steps per run; four of them for each update."""
 
+EVALUATIONS = 24
+"""Per run: what decides how finely "steps to 80 %" is known."""
 
-def path_of(task: str, algorithm: str, seed: int) -> Path:
-  """Where the evaluations of a run are kept."""
-  return OUT / f"{task}-{algorithm}-{seed}.json"
+CANDIDATES = 40
+"""A third of the paper's, for the hours that it takes; the same for all."""
+
+EPISODES, EPISODES_SEED = 200, 7
+"""Of the evaluation after training."""
+
+KEPT = ("loss/", "npql/", "prior/", "policy/", "q/", "ap/", "grad_norm/", "faults/")
+"""Metrics of training that are kept beside each evaluation."""
+
+Result = dict[str, Any]
 
 
-def train(task: str, algorithm: str, seed: int) -> None:
-  """One run, from which only its evaluations are kept."""
+def path_of(task: str, row: str, seed: int) -> Path:
+  """Where the result of a run is kept."""
+  return OUT / f"{task}-{row}-{seed}.json"
+
+
+def command_of(task: str, row: str, seed: int) -> list[str]:
+  """The run on the command line, without its folder."""
+  algorithm, flags, budget = ROWS[row]
+  common = (
+    f"--obs state --seed {seed} --total-steps {budget * STEPS[task]} --no-video "
+    f"--eval-every {budget * STEPS[task] // EVALUATIONS} "
+    f"--agent.target-samples {CANDIDATES} --agent.policy-samples {CANDIDATES}"
+  )
+  return ["train", task, "--algorithm", algorithm, *common.split(), *flags.split()]
+
+
+def train(task: str, row: str, seed: int) -> None:
+  """One run and its evaluation; the result appears when both are complete."""
+  command, path = command_of(task, row, seed), path_of(task, row, seed)
   with tempfile.TemporaryDirectory() as folder:
     run = Path(folder) / "run"
-    command = [sys.executable, "-m", "apnpql_jax", "train", task, "--run", str(run)]
-    command += f"--obs state --algorithm {algorithm} --seed {seed}".split()
-    command += f"--total-steps {STEPS[task]} --no-video".split()
-    subprocess.run([*command, *ALGORITHMS[algorithm].split()], check=True)
-    rows = evaluations(open_run(run))
-  path_of(task, algorithm, seed).write_text(json.dumps(rows, indent=1) + "\n")
+    with (Path(folder) / "said.txt").open("w") as said:
+      apnpql = [sys.executable, "-m", "apnpql_jax"]
+      subprocess.run([*apnpql, *command, "--run", str(run)], check=True, stderr=said)
+      play = f"--episodes {EPISODES} --seed {EPISODES_SEED} --json".split()
+      done = subprocess.run(
+        [*apnpql, "evaluate", str(run), *play],
+        check=True,
+        stdout=subprocess.PIPE,
+        stderr=said,
+      )
+    result = {
+      "command": command,
+      "versions": json.loads(open_run(run).versions.read_text()),
+      "config": json.loads((run / "config.json").read_text()),
+      "final": json.loads(done.stdout),
+      "evaluations": evaluations(open_run(run)),
+    }
+  part = path.with_suffix(".part")
+  part.write_text(json.dumps(result, indent=1) + "\n")
+  os.replace(part, path)
+  print(f"{path.stem}: {result['final']['successes']} of {EPISODES}", flush=True)
 
 
-def results() -> dict[tuple[str, str], list[list[dict[str, float]]]]:
-  """(task, algorithm) -> evaluations of each seed at hand."""
-  found: dict[tuple[str, str], list[list[dict[str, float]]]] = {}
-  for path in sorted(OUT.glob("*-*-*.json")):
-    task, algorithm, _ = path.stem.split("-")
-    found.setdefault((task, algorithm), []).append(json.loads(path.read_text()))
+def evaluations(folder: RunFolder) -> list[dict[str, Any]]:
+  """Rows of the held-out evaluations, each with the metrics of training before it."""
+  found, last = [], {}
+  for row in read_rows(folder.metrics_jsonl):
+    last |= {name: x for name, x in row.items() if name.startswith(KEPT)}
+    if "eval/success_rate" in row:
+      names = ("step", "time/wall_s", "eval/success_rate", "eval/episodes")
+      found.append({name: row[name] for name in names} | last)
   return found
 
 
-def plot(found: dict[tuple[str, str], list[list[dict[str, float]]]]) -> None:
+def results() -> dict[tuple[str, str], list[Result]]:
+  """(task, row) -> results of each seed at hand.
+
+  Raises:
+    SystemExit: one of them was made with another command than it would be now.
+  """
+  found: dict[tuple[str, str], list[Result]] = {}
+  for task, row in itertools.product(STEPS, ROWS):
+    for path in sorted(OUT.glob(f"{task}-{row}-*.json")):
+      result = json.loads(path.read_text())
+      if result["command"] != command_of(task, row, result["config"]["seed"]):
+        sys.exit(f"{path.name} is of other settings; remove it to train it again")
+      found.setdefault((task, row), []).append(result)
+  return found
+
+
+def plot(found: dict[tuple[str, str], list[Result]]) -> None:
   """A panel per task: mean over seeds, and from the lowest to the highest."""
   figure, panels = plt.subplots(
     1, len(STEPS), figsize=(3.4 * len(STEPS), 3.2), sharey=True, layout="constrained"
   )
   for panel, task in zip(panels, STEPS, strict=True):
-    for algorithm in ALGORITHMS:
-      if runs := found.get((task, algorithm)):
-        rates = 100 * np.array([[row["eval/success_rate"] for row in r] for r in runs])
-        steps = [row["step"] for row in runs[0]]
-        panel.plot(steps, rates.mean(0), ".-", label=algorithm)
+    for row in PAPER:
+      if runs := found.get((task, row)):
+        curves = [run["evaluations"] for run in runs]
+        rates = 100 * np.array([[x["eval/success_rate"] for x in c] for c in curves])
+        steps = [x["step"] for x in curves[0]]
+        panel.plot(steps, rates.mean(0), ".-", label=f"{row} ({len(runs)})")
         panel.fill_between(steps, rates.min(0), rates.max(0), alpha=0.2)
     panel.set(title=task, xlabel="environment steps", ylim=(-2, 102))
+    panel.legend()
   panels[0].set_ylabel("held-out success (%)")
-  panels[0].legend()
   figure.savefig(OUT / "curves.png", dpi=120)
 
 
-def table(found: dict[tuple[str, str], list[list[dict[str, float]]]]) -> str:
-  """Final success of each seed, and the steps after which it was above the goal."""
+def table(found: dict[tuple[str, str], list[Result]]) -> str:
+  """Success after training, and the steps after which it was above the goal."""
   lines = [
-    f"| task | algorithm | solved at the end, % | steps to {100 * GOAL:.0f} % |",
-    "|---|---|---|---|",
+    f"| task | row | seeds | solved after training | rate (95 %) | steps to "
+    f"{100 * GOAL:.0f} % |",
+    "|---|---|---|---|---|---|",
   ]
-  for (task, algorithm), runs in found.items():
-    final = ", ".join(f"{100 * rows[-1]['eval/success_rate']:.0f}" for rows in runs)
-    steps = ", ".join(map(_steps_to_goal, runs))
-    lines.append(f"| {task} | {algorithm} | {final} | {steps} |")
+  for (task, row), runs in found.items():
+    counts = [run["final"]["successes"] for run in runs]
+    solved, episodes = sum(counts), EPISODES * len(runs)
+    low, high = wilson_interval(solved, episodes)
+    lines.append(
+      f"| {task} | {row} | {len(runs)} | {', '.join(map(str, counts))} of {EPISODES} "
+      f"| {100 * solved / episodes:.1f} % ({100 * low:.1f} to {100 * high:.1f}) "
+      f"| {', '.join(map(_steps_to_goal, runs))} |"
+    )
   return "\n".join(lines) + "\n"
 
 
-def _steps_to_goal(rows: list[dict[str, float]]) -> str:
+def _steps_to_goal(run: Result) -> str:
+  rows = run["evaluations"]
   hits = [row["step"] for row in rows if row["eval/success_rate"] >= GOAL]
-  return f"{hits[0]:,.0f}" if hits else "never"
+  return f"{hits[0]:,.0f}" if hits else f"> {rows[-1]['step']:,.0f}"
 
 
 def main() -> None:
   """Command line; see the module's docstring."""
   parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
   parser.add_argument("--tasks", nargs="+", choices=STEPS, default=list(STEPS))
-  parser.add_argument(
-    "--algorithms", nargs="+", choices=ALGORITHMS, default=list(ALGORITHMS)
-  )
+  parser.add_argument("--rows", nargs="+", choices=ROWS, default=list(PAPER))
   parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+  parser.add_argument("--jobs", type=int, default=1, help="runs at once")
   args = parser.parse_args()
   OUT.mkdir(exist_ok=True)
-  for seed, task, name in itertools.product(args.seeds, args.tasks, args.algorithms):
-    if not path_of(task, name, seed).exists():
-      train(task, name, seed)
+  results()  # Refuses before hours are spent.
+  with ThreadPoolExecutor(args.jobs) as pool:
+    runs = [
+      pool.submit(train, task, row, seed)
+      for seed, task, row in itertools.product(args.seeds, args.tasks, args.rows)
+      if not path_of(task, row, seed).exists()
+    ]
+    for run in runs:
+      run.result()
   found = results()
   plot(found)
   (OUT / "table.md").write_text(table(found))
