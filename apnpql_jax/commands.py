@@ -83,6 +83,7 @@ def evaluate(args: Evaluate, argv: Sequence[str]) -> Json:
     seed=args.seed,
     backend=args.backend,
     step=_checkpoint_step(args),
+    greedy=args.greedy,
   )
 
 
@@ -193,7 +194,7 @@ def _check_registered(config: TrainConfig, *, devices: int) -> None:
   validate(
     config,
     tasks=tasks.task_names(),
-    algorithms=algorithms.epsilon_is_bounded(),
+    algorithms=algorithms.epsilon_bounds(),
     memory_bytes=memory.available_memory(),
     devices=devices,
   )

@@ -105,6 +105,7 @@ def evaluate_run(
   seed: int,
   backend: str | None = None,
   step: int | None = None,
+  greedy: bool = False,
 ) -> dict[str, Any]:
   """Plays held-out episodes with a checkpoint of a run.
 
@@ -114,6 +115,7 @@ def evaluate_run(
     seed: of rows and actions.
     backend: physics engine; the run's own if None.
     step: of the checkpoint; the newest if None.
+    greedy: the candidate of highest value acts, not one drawn by its weight.
 
   Raises:
     ConfigError: not a run folder, or no readable checkpoint.
@@ -133,7 +135,7 @@ def evaluate_run(
   for line in found.damaged:
     print(line, file=sys.stderr)
   learner = found.items["learner"]
-  play = make_player(env, lambda params: agent_policy(agent, params, greedy=False))
+  play = make_player(env, lambda params: agent_policy(agent, params, greedy=greedy))
   figures = play_held_out(
     env, play, learner.target_params, episodes=episodes, seed=seed
   )
@@ -141,6 +143,7 @@ def evaluate_run(
     "task": config.env.task,
     "algorithm": config.agent.algorithm,
     "backend": env.physics.name,
+    "greedy": greedy,
     **figures,
     "checkpoint_step": found.step,
     "wall_s": time.monotonic() - began,

@@ -88,6 +88,9 @@ class Evaluate:
   seed: int = 0
   """Seed of the episodes and of the policy."""
 
+  greedy: _Flag = False
+  """Take the candidate of highest value instead of drawing one as in training."""
+
   backend: Annotated[
     str | None, tyro.conf.arg(help_behavior_hint="(default: as in training)")
   ] = None

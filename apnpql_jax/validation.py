@@ -61,7 +61,7 @@ def validate(
   config: TrainConfig,
   *,
   tasks: Sequence[str] | None = None,
-  algorithms: Mapping[str, bool] | None = None,
+  algorithms: Mapping[str, Sequence[str]] | None = None,
   memory_bytes: int | None = None,
   devices: int = 1,
 ) -> None:
@@ -70,8 +70,8 @@ def validate(
   Args:
     config: what to check.
     tasks: valid task names; not checked if None.
-    algorithms: valid algorithm names, with True where candidates are weighed, so that
-      they bound epsilon; not checked if None.
+    algorithms: valid algorithm names -> settings of the agent, numbers of candidates,
+      below the log of which epsilon must lie; not checked if None.
     memory_bytes: memory of a device the replays must fit into; not checked if None.
     devices: between how many worlds and batches are split.
 
@@ -88,9 +88,8 @@ def validate(
   _validate_env(config.env)
   _validate_agent(config.agent)
   _validate_returns(config.agent)
-  limited = config.agent.temperature != "fixed"
-  if limited and algorithms is not None and algorithms[config.agent.algorithm]:
-    _validate_epsilon(config.agent)
+  if algorithms is not None and config.agent.temperature != "fixed":
+    _validate_epsilon(config.agent, algorithms[config.agent.algorithm])
   _validate_expert(config)
   _validate_replay(config, None if memory_bytes is None else memory_bytes * devices)
   for name, number in (
@@ -212,16 +211,16 @@ def _validate_returns(agent: AgentConfig) -> None:
     )
 
 
-def _validate_epsilon(agent: AgentConfig) -> None:
-  samples = min(agent.target_samples, agent.policy_samples)
+def _validate_epsilon(agent: AgentConfig, bounds: Sequence[str]) -> None:
   # The KL of a distribution over S samples from their uniform weights is at most
   # log S: a larger limit never binds, and the temperature would run to zero.
-  if agent.epsilon >= math.log(samples):
-    raise ConfigError(
-      f"agent.epsilon={agent.epsilon} can never bind: it must be below log({samples})"
-      f" = {math.log(samples):.3f}; lower it, or raise agent.target_samples and "
-      "agent.policy_samples"
-    )
+  for name in bounds:
+    samples = getattr(agent, name)
+    if agent.epsilon >= math.log(samples):
+      raise ConfigError(
+        f"agent.epsilon={agent.epsilon} can never bind: it must be below log({samples})"
+        f" = {math.log(samples):.3f}; lower it, or raise agent.{name}"
+      )
 
 
 def _validate_expert(config: TrainConfig) -> None:

@@ -139,7 +139,7 @@ def test_refusals_name_the_setting_and_the_fix(path, value, words):
     validate(
       changed(path, value),
       tasks=["push_plate", "stack_box"],
-      algorithms={"ap_npql": True, "sac": False},
+      algorithms={"ap_npql": ("target_samples", "policy_samples"), "sac": ()},
     )
   message = str(error.value)
   assert "\n" not in message
@@ -148,7 +148,12 @@ def test_refusals_name_the_setting_and_the_fix(path, value, words):
 
 
 @pytest.mark.parametrize(
-  ("epsilon", "weighed"), [(math.log(100) - 1e-6, True), (9.0, False)]
+  ("epsilon", "weighed"),
+  [
+    (math.log(100) - 1e-6, ("target_samples", "policy_samples")),
+    (math.log(120) - 1e-6, ("target_samples",)),
+    (9.0, ()),
+  ],
 )
 def test_epsilon_is_bounded_only_where_candidates_are_weighed(epsilon, weighed):
   validate(changed("agent.epsilon", epsilon), algorithms={"ap_npql": weighed})
@@ -156,7 +161,7 @@ def test_epsilon_is_bounded_only_where_candidates_are_weighed(epsilon, weighed):
 
 def test_a_fixed_temperature_keeps_no_limit():
   agent = dataclasses.replace(AgentConfig(), epsilon=9.0, temperature="fixed")
-  validate(TrainConfig(agent=agent), algorithms={"ap_npql": True})
+  validate(TrainConfig(agent=agent), algorithms={"ap_npql": ("policy_samples",)})
 
 
 def test_defaults_of_the_learner_are_the_constants_of_the_paper():

@@ -74,9 +74,9 @@ def test_a_run_leaves_everything_behind(finished):
 
 def test_evaluate_reports_the_newest_checkpoint(finished):
   run_dir, _ = finished
-  figures = evaluate_run(run_dir, episodes=6, seed=3)
+  figures = evaluate_run(run_dir, episodes=6, seed=3, greedy=True)
   assert figures["checkpoint_step"] == 64
-  assert figures["episodes"] == 6
+  assert figures["episodes"] == 6 and figures["greedy"]
   assert figures["backend"] == "native" and figures["algorithm"] == "ap_npql"
   low, high = figures["ci95"]
   assert 0 <= low <= figures["success_rate"] <= high <= 1

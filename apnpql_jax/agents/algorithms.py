@@ -122,6 +122,13 @@ def algorithm_of(config: AgentConfig) -> Algorithm:
   return row
 
 
-def epsilon_is_bounded() -> dict[str, bool]:
-  """Name of each row -> whether epsilon must lie below log of the candidates."""
-  return {name: row.policy_update is not reverse_kl for name, row in ALGORITHMS.items()}
+def epsilon_bounds() -> dict[str, tuple[str, ...]]:
+  """Name of each row -> settings that say how many candidates q weighs somewhere; below
+  the log of each of them epsilon must lie."""
+
+  def bounds(row: Algorithm) -> tuple[str, ...]:
+    target = ("target_samples",) if row.policy is non_parametric else ()
+    update = ("policy_samples",) if row.policy_update is not reverse_kl else ()
+    return (*target, *update)
+
+  return {name: bounds(row) for name, row in ALGORITHMS.items()}

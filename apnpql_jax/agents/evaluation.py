@@ -111,7 +111,7 @@ class TD0:
 
   def value(self, outputs: Array) -> Array:
     """See ``Evaluation``."""
-    return jnp.min(outputs, axis=-1)
+    return outputs[..., 0]
 
   def target(self, look: Look, batch: Transition) -> Array:
     """See ``Evaluation``."""
@@ -134,6 +134,10 @@ class ClippedDoubleQ(TD0):
   def head(self, hidden: Sequence[int]) -> nn.Module:
     """See ``Evaluation``."""
     return TwinValueHeads(hidden, (self.config.initial_value,) * 2)
+
+  def value(self, outputs: Array) -> Array:
+    """See ``Evaluation``."""
+    return jnp.min(outputs, axis=-1)
 
 
 class Retrace(TD0):

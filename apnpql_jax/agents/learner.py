@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import optax
 
 from apnpql_jax.agents import objectives
-from apnpql_jax.agents.algorithms import Algorithm, algorithm_of, epsilon_is_bounded
+from apnpql_jax.agents.algorithms import Algorithm, algorithm_of, epsilon_bounds
 from apnpql_jax.agents.augmentation import augment
 from apnpql_jax.agents.networks import Heads, Networks, Params, make_networks
 from apnpql_jax.agents.policies import Candidates
@@ -57,7 +57,7 @@ def make_agent(config: AgentConfig) -> Agent:
     ConfigError: unknown algorithm, or settings that cannot work, such as a KL limit
       that the samples can never reach.
   """
-  validate(TrainConfig(agent=config), algorithms=epsilon_is_bounded())
+  validate(TrainConfig(agent=config), algorithms=epsilon_bounds())
   algorithm = algorithm_of(config)
   groups = algorithm.groups(config)
   networks = make_networks(config, groups, algorithm.policy_evaluation(config))
@@ -224,7 +224,7 @@ def total_loss(
   prior = algorithm.regulariser(heads, slow)
   improved = algorithm.policy_update(heads, prior, key)
   candidates = improved.candidates
-  q_values, weights = candidates.q_values, candidates.weights
+  q_values, weights = candidates.q_values, improved.weights
   losses = {
     "loss/ap": objectives.ap_loss(
       predicted, batch.primitives_tm1, delta=config.ap_delta

@@ -22,6 +22,7 @@ class Improvement(struct.PyTreeNode):
   """The improved policy at ``*b`` states and the losses that bring it about."""
 
   candidates: Candidates  # of q, or of pi_psi where the KL is the reverse one
+  weights: Array  # f32[S, *b]: of q on the candidates; sum to one over S
   kl: Array  # f32[*b]: from that policy to the regulariser, nats
   entropy: Array  # f32[*b]: of q, or of pi_psi where there is one, nats
   losses: dict[str, Array]  # f32[*b] each
@@ -33,7 +34,7 @@ def none(heads: Heads, prior: ActionDistribution, key: Array) -> Improvement:
   q = non_parametric(heads, prior, key, num_samples=config.policy_samples)
   dual = objectives.alpha_loss(q.q_values, heads.alpha(), epsilon=config.epsilon)
   kl = boltzmann.kl_to_prior(q.weights)
-  return Improvement(q, kl, q.entropy, {"loss/alpha": dual})
+  return Improvement(q, q.weights, kl, q.entropy, {"loss/alpha": dual})
 
 
 def forward_kl(heads: Heads, prior: ActionDistribution, key: Array) -> Improvement:
@@ -67,4 +68,7 @@ def reverse_kl(heads: Heads, prior: ActionDistribution, key: Array) -> Improveme
     "loss/policy": jax.lax.stop_gradient(alpha) * kl - pi.value,
     "loss/alpha": objectives.kl_dual(kl, alpha, epsilon=config.epsilon),
   }
-  return Improvement(pi, kl, pi.base.entropy_bound(), losses)
+  # b exp(Q / alpha) / pi, times the weights that pi itself has on its draws.
+  tilted = pi.q_values + alpha * (jnp.log(pi.weights) - log_ratio)
+  weights = jax.lax.stop_gradient(boltzmann.importance_weights(tilted, alpha))
+  return Improvement(pi, weights, kl, pi.base.entropy_bound(), losses)

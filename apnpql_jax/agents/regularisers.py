@@ -6,6 +6,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
+
 from apnpql_jax.agents import objectives, policies
 from apnpql_jax.agents.networks import Heads
 from apnpql_jax.agents.policies import Candidates
@@ -67,8 +69,12 @@ def fit_advantageous(
   """
   del candidates
   samples = batch.action_tm1[None]
+  # Not the draws that the policy update takes with this key.
   policy = policies.parametric(
-    heads, prior, key, num_samples=heads.config.policy_samples
+    heads,
+    prior,
+    jax.random.fold_in(key, 1),
+    num_samples=heads.config.policy_samples,
   )
   good = heads.q(samples) >= policy.value[None]
   return _fit(heads, prior, samples, good.astype(samples.dtype), nu)
