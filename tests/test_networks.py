@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -128,14 +129,14 @@ def test_an_lstm_reads_what_would_be_phi_of_each_instant():
   networks = all_networks(dataclasses.replace(CONFIG, lstm_instants=3))
   seen = observation(2 * 3, pixels=True).replace(global_image=None)
   recent = jax.tree.map(lambda x: x.reshape(2, 3, *x.shape[1:]), seen)
-  params = networks.init(jax.random.key(0), recent)
+  params = jax.jit(networks.init)(jax.random.key(0), recent)
   lstm = params["encoder"]["lstm"]
   without = {k: v for k, v in params["encoder"].items() if k != "lstm"}
   # Nothing else is new, and nothing else begins elsewhere.
   jax.tree.map(
     np.testing.assert_array_equal,
     params | {"encoder": without},
-    plain.init(jax.random.key(0), seen),
+    jax.jit(plain.init)(jax.random.key(0), seen),
   )
   rng = np.random.default_rng(4)
   lstm = jax.tree.map(lambda x: rng.normal(size=x.shape).astype(np.float32), lstm)
@@ -189,16 +190,19 @@ def test_robot_inputs_hold_the_newest_state_and_the_changes():
 )
 def test_outputs_have_the_declared_shapes(pixels: bool, objects: bool):
   networks = all_networks()
+
+  def look(seen: Observation) -> Any:
+    params = networks.init(jax.random.key(0), seen)
+    assert tuple(params) == GROUPS
+    heads, actions = networks.at(params, seen), jnp.zeros((9, 4, 7))
+    found = heads.phi, heads.primitives(), heads.alpha(), heads.z(actions)
+    return (*found, heads.q(actions)), {3: heads.prior(), 1: heads.policy()}
+
   seen = observation(4, pixels=pixels, objects=objects)
-  params = networks.init(jax.random.key(0), seen)
-  assert tuple(params) == GROUPS
-  heads = networks.at(params, seen)
-  assert heads.phi.shape == (4, 20)
-  assert heads.primitives().shape == (4, 3, 7)
-  assert heads.alpha().shape == (4,)
-  assert heads.z(jnp.zeros((9, 4, 7))).shape == (9, 4, 11)
-  assert heads.q(jnp.zeros((9, 4, 7))).shape == (9, 4)
-  for num, mixture in ((3, heads.prior()), (1, heads.policy())):
+  outputs, mixtures = jax.eval_shape(look, seen)
+  shapes = [(4, 20), (4, 3, 7), (4,), (9, 4, 11), (9, 4)]
+  assert [output.shape for output in outputs] == shapes
+  for num, mixture in mixtures.items():
     assert mixture.mean.shape == (4, num, 6)
     assert mixture.scale_tril.shape == (4, num, 6, 6)
     assert mixture.logits.shape == mixture.gripper_logits.shape == (4, num)
@@ -210,14 +214,14 @@ def test_features_depend_on_every_modality(changed: str, kind: str):
   config = dataclasses.replace(CONFIG, global_features=kind, wrist_features=kind)
   networks = all_networks(config)
   seen = observation(2, pixels=True)
-  params = networks.init(jax.random.key(0), seen)
+  params = jax.jit(networks.init)(jax.random.key(0), seen)
   other = seen.replace(**{changed: getattr(seen, changed) // 2})
   assert np.any(networks.at(params, seen).phi != networks.at(params, other).phi)
 
 
 def test_value_head_is_a_plain_network_of_features_and_action():
   networks = all_networks()
-  params = networks.init(jax.random.key(0), observation(3, pixels=False))
+  params = jax.jit(networks.init)(jax.random.key(0), observation(3, pixels=False))
   rng = np.random.default_rng(2)
   phi = jnp.asarray(rng.normal(size=(3, 20)), jnp.float32)
   actions = jnp.asarray(rng.uniform(-1.0, 1.0, (5, 3, 7)), jnp.float32)
@@ -252,7 +256,7 @@ def test_fresh_networks_predict_the_configured_start():
 def fresh_heads(config: AgentConfig) -> Heads:
   """Untrained networks at eight states."""
   networks, seen = all_networks(config), observation(8, pixels=False)
-  return networks.at(networks.init(jax.random.key(0), seen), seen)
+  return networks.at(jax.jit(networks.init)(jax.random.key(0), seen), seen)
 
 
 @pytest.mark.parametrize(("mode", "values"), [("state", 8), ("shared", 1)])
@@ -340,7 +344,7 @@ def test_a_limit_lets_the_gradient_back_in():
 def test_prior_is_centred_on_the_primitives_within_the_action_box():
   networks = all_networks()
   seen = observation(4, pixels=False)
-  params = networks.init(jax.random.key(0), seen)
+  params = jax.jit(networks.init)(jax.random.key(0), seen)
   params["ap"]["out"]["bias"] = jnp.linspace(-4.0, 4.0, 21)
   heads = networks.at(params, seen)
   primitives, prior = np.asarray(heads.primitives()), heads.prior()
