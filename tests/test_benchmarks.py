@@ -191,6 +191,7 @@ def test_the_document_is_made_of_what_is_at_hand(tmp_path):
   setting = {"task": "t", "backend": "mjx", "obs": "pixels", "worlds": 4}
   shares = {"physics": 0.6, "rest": 0.4}
   steps = {**setting, "env": speed, "env_policy": speed, "shares": shares}
+  training = setting | speed | {"updates_per_s": 9.0, "shares": shares}
   points = [
     {
       "axis": "worlds",
@@ -209,6 +210,7 @@ def test_the_document_is_made_of_what_is_at_hand(tmp_path):
   reports = {
     "render": render | {"results": [missing]},
     "env_steps": {"results": [steps]},
+    "end_to_end": {"results": [training]},
     "growth": {"results": points},
   }
   for name, fields in reports.items():
@@ -223,4 +225,5 @@ def test_the_document_is_made_of_what_is_at_hand(tmp_path):
   # Half of proportional from 1 to 4, proportional from there on.
   assert "| 4 | 200 (200 to 200) | 0.50 | 50 % |" in text
   assert "| 16 | 800 (800 to 800) | 1.00 | 50 % |" in text
-  assert (tmp_path / "images" / "growth.png").stat().st_size > 1000
+  for plot in ("growth", "rates"):
+    assert (tmp_path / "images" / f"{plot}.png").stat().st_size > 1000

@@ -69,6 +69,6 @@ def reverse_kl(heads: Heads, prior: ActionDistribution, key: Array) -> Improveme
     "loss/alpha": objectives.kl_dual(kl, alpha, epsilon=config.epsilon),
   }
   # b exp(Q / alpha) / pi, times the weights that pi itself has on its draws.
-  tilted = pi.q_values + alpha * (jnp.log(pi.weights) - log_ratio)
+  tilted = pi.q_values + alpha[None] * (jnp.log(pi.weights) - log_ratio)
   weights = jax.lax.stop_gradient(boltzmann.importance_weights(tilted, alpha))
   return Improvement(pi, weights, kl, pi.base.entropy_bound(), losses)
