@@ -51,20 +51,20 @@ class Columns(NamedTuple):
   regulariser: str
   policy: str
   fitted_to: str | None
-  kl: str | None
+  kl: str
   outputs: int
   windows: bool = False
 
 
 COLUMNS = {
-  "ap_npql": Columns("b", "q", "q", None, SMALL.num_atoms),
+  "ap_npql": Columns("b", "q", "q", "none", SMALL.num_atoms),
   "ap_mpo": Columns("b", "pi", "q", "forward", SMALL.num_atoms),
   "ap_sac": Columns("b", "pi", "pi", "reverse", SMALL.num_atoms),
   "abm_mpo": Columns("b", "pi", "good", "forward", 1),
   "svg_prior": Columns("b", "pi", "pi", "reverse", 1, windows=True),
   "mpo": Columns("past", "pi", None, "forward", 1, windows=True),
   "sac": Columns("uniform", "pi", None, "reverse", 2),
-  "ap_cem": Columns("b", "cem", "q", None, 2),
+  "ap_cem": Columns("b", "cem", "q", "none", 2),
 }
 
 
@@ -142,8 +142,8 @@ def log_prob(distribution: ActionDistribution, actions: Array) -> np.ndarray:
   if isinstance(distribution, UniformBox):
     return np.full(actions.shape[:2], -7.0 * np.log(2.0))
   each = [
-    scipy_log_prob(jax.tree.map(lambda x, i=i: x[i], distribution), actions[:, i])
-    for i in range(BATCH)
+    scipy_log_prob(jax.tree.map(lambda x, i=i: x[i], distribution), one)
+    for i, one in enumerate(np.moveaxis(np.asarray(actions), 1, 0))
   ]
   return np.stack(each, axis=1)
 

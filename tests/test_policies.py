@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 from batches import random_batch
 import jax
@@ -92,7 +93,7 @@ def test_cross_entropy_method_is_that_of_qt_opt(heads):
     mean.append(arm[best].mean(0))
     std.append(arm[best].std(0).clip(0.01))
     close.append(draws[best, 6].mean().clip(0.001, 0.999))
-  base = found.base
+  base: Any = found.base
   np.testing.assert_allclose(base.mean[:, 0], mean, atol=1e-5)
   expected = np.asarray(std)[..., None] * np.eye(6)
   np.testing.assert_allclose(base.scale_tril[:, 0], expected, atol=1e-5)
