@@ -1,4 +1,4 @@
-"""Random transitions for tests of the learner."""
+"""Random transitions for tests of the learner, and a learner small enough for them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from apnpql_jax.config import AgentConfig
 from apnpql_jax.types import Observation, Slot, TimeStep, Transition
+
+SMALL = AgentConfig(
+  hidden=(16, 16),
+  feature_dim=16,
+  num_atoms=11,
+  target_samples=8,
+  policy_samples=8,
+  patch_channels=4,
+  conv_channels=4,
+  n_step=2,
+)
+"""Compiles in a few seconds, whichever row of Table I it is given."""
 
 
 def random_batch(

@@ -1,34 +1,33 @@
-"""Every row of Table I: which loss trains what, and that it survives anything."""
+"""Every row of Table I: what each column does, and which loss trains what."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import dataclasses
 import functools
+from typing import Any, NamedTuple
 
-from batches import random_batch
+from batches import SMALL, random_batch
+from densities import scipy_log_prob
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import special
 import tiny
 
 from apnpql_jax import validation
-from apnpql_jax.agents import algorithms
+from apnpql_jax.agents import algorithms, regularisers
 from apnpql_jax.agents.algorithms import ALGORITHMS, algorithm_of
-from apnpql_jax.agents.learner import bellman_target, make_agent, total_loss
-from apnpql_jax.config import AgentConfig
+from apnpql_jax.agents.learner import Agent, bellman_target, make_agent, total_loss
+from apnpql_jax.agents.networks import Heads
+from apnpql_jax.agents.policies import clip_action
+from apnpql_jax.dists.action import ActionDistribution, UniformBox
+from apnpql_jax.types import Array, Metrics, Transition
 
-CONFIG = AgentConfig(
-  hidden=(16, 16),
-  feature_dim=16,
-  num_atoms=11,
-  target_samples=8,
-  policy_samples=8,
-  patch_channels=4,
-  conv_channels=4,
-  n_step=2,
-)
 BATCH = 6
+NU = 0.1
+KEY = jax.random.key(2)
 VALUE = {"loss/q": {"encoder", "z"}, "loss/ap": {"encoder", "ap"}}
 ALPHA = {"loss/alpha": {"alpha"}}
 PRIOR = {"loss/m": {"bp"}, "loss/nu": {"nu"}}
@@ -46,29 +45,70 @@ TRAINS = {
 """Row -> loss -> parameters that it trains, by the paper's names of its arguments."""
 
 
-def losses_and_slopes(config: AgentConfig):
-  """Total loss, its parts, the gradient of each part, and the metrics of one batch."""
-  agent, algorithm = make_agent(config), algorithm_of(config)
+class Columns(NamedTuple):
+  """A row of docs/algorithm.md, section 3."""
+
+  regulariser: str
+  policy: str
+  fitted_to: str | None
+  kl: str
+  outputs: int
+  windows: bool = False
+
+
+COLUMNS = {
+  "ap_npql": Columns("b", "q", "q", "none", SMALL.num_atoms),
+  "ap_mpo": Columns("b", "pi", "q", "forward", SMALL.num_atoms),
+  "ap_sac": Columns("b", "pi", "pi", "reverse", SMALL.num_atoms),
+  "abm_mpo": Columns("b", "pi", "good", "forward", 1),
+  "svg_prior": Columns("b", "pi", "pi", "reverse", 1, windows=True),
+  "mpo": Columns("past", "pi", None, "forward", 1, windows=True),
+  "sac": Columns("uniform", "pi", None, "reverse", 2),
+  "ap_cem": Columns("b", "cem", "q", "none", 2),
+}
+
+
+class Example(NamedTuple):
+  """One batch, and what the learner makes of it."""
+
+  agent: Agent
+  batch: Transition
+  trained: dict[str, Any]
+  slow: dict[str, Any]
+  learn: Callable[[Transition], tuple[dict[str, Any], tuple[Array, Metrics]]]
+  """Slopes of each loss; total loss and metrics."""
+
+  def heads(self, params: dict[str, Any]) -> Heads:
+    return self.agent.networks.at(params, self.batch.observation_tm1)
+
+
+@functools.cache
+def example_of(name: str) -> Example:
+  """Parameters far from their first values, where no two candidates are alike."""
+  config = dataclasses.replace(SMALL, algorithm=name)
+  agent, row = make_agent(config), algorithm_of(config)
   batch = random_batch(1, BATCH, windows=config.n_step)
-  params = agent.networks.init(jax.random.key(0), batch.observation_tm1)
-  trained = {**params, "nu": jnp.float32(0.1)}
+  rng = np.random.default_rng(0)
+  params = jax.tree.map(
+    lambda x: x + 0.3 * jnp.asarray(rng.normal(size=x.shape), jnp.float32),
+    agent.networks.init(jax.random.key(0), batch.observation_tm1),
+  )
+  trained = {**params, "nu": jnp.float32(NU)}
   # A target network that has fallen behind, as it has in training.
   slow = jax.tree.map(lambda x: 0.9 * x, params)
 
-  def losses(trained):
-    target = bellman_target(agent.networks, algorithm, slow, batch, jax.random.key(1))
-    total, metrics = total_loss(
-      agent.networks, algorithm, trained, slow, batch, target, jax.random.key(2)
-    )
+  def losses(trained, batch):
+    target = bellman_target(agent.networks, row, slow, batch, jax.random.key(1))
+    total, metrics = total_loss(agent.networks, row, trained, slow, batch, target, KEY)
     parts = {k: v for k, v in metrics.items() if k.startswith("loss/")}
     return parts, (total, metrics)
 
   with jax.numpy_rank_promotion("raise"):
-    slope = jax.jit(
+    learn = jax.jit(
       jax.jacrev(losses, has_aux=True), compiler_options=tiny.FAST_COMPILE
     )
-    slopes, (total, metrics) = slope(trained)
-  return total, metrics, slopes
+    learn(trained, batch)
+  return Example(agent, batch, trained, slow, functools.partial(learn, trained))
 
 
 def touched(slope: dict) -> set[str]:
@@ -78,9 +118,8 @@ def touched(slope: dict) -> set[str]:
 
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_each_loss_trains_exactly_the_parameters_the_paper_names(name: str):
-  total, metrics, slopes = losses_and_slopes(
-    dataclasses.replace(CONFIG, algorithm=name)
-  )
+  example = example_of(name)
+  slopes, (total, metrics) = example.learn(example.batch)
   assert {k: touched(slope) for k, slope in slopes.items()} == TRAINS[name]
   # What is trained is what there is.
   assert set().union(*TRAINS[name].values()) | {"nu"} == set(slopes["loss/q"])
@@ -93,58 +132,117 @@ def test_settings_name_every_evaluation():
   assert {"row", *algorithms.EVALUATIONS} == set(validation.EVALUATIONS)
 
 
-@pytest.mark.parametrize(
-  ("changes", "missing"),
-  [
-    ({"temperature": "fixed"}, {"loss/alpha": set()}),
-    ({"regulariser": "uniform"}, {"loss/m": None, "loss/nu": None}),
-  ],
-)
-def test_ablations_train_less_and_nothing_else(changes, missing):
-  _, _, slopes = losses_and_slopes(dataclasses.replace(CONFIG, **changes))
-  expected = {k: v for k, v in (TRAINS["ap_npql"] | missing).items() if v is not None}
-  assert {k: touched(slope) for k, slope in slopes.items()} == expected
+def regulariser_of(name: str, heads: Heads, slow: Heads) -> ActionDistribution:
+  kinds = {"b": heads.prior, "uniform": lambda: UniformBox((BATCH,), 6)}
+  return {**kinds, "past": slow.policy}[COLUMNS[name].regulariser]()
+
+
+def log_prob(distribution: ActionDistribution, actions: Array) -> np.ndarray:
+  """f64[S, B], one state after the other."""
+  if isinstance(distribution, UniformBox):
+    return np.full(actions.shape[:2], -7.0 * np.log(2.0))
+  each = [
+    scipy_log_prob(jax.tree.map(lambda x, i=i: x[i], distribution), one)
+    for i, one in enumerate(np.moveaxis(np.asarray(actions), 1, 0))
+  ]
+  return np.stack(each, axis=1)
+
+
+def values(heads: Heads, actions: Array) -> np.ndarray:
+  return np.asarray(heads.q(clip_action(actions)), np.float64)
+
+
+def of_q(heads: Heads, prior: ActionDistribution, key: Array):
+  """Draws of the regulariser, and their weights under q (Eq. 6)."""
+  samples = prior.sample(key, SMALL.policy_samples)
+  return samples, special.softmax(values(heads, samples) / heads.alpha(), axis=0)
+
+
+def of_pi(heads: Heads, key: Array):
+  """Half as many draws of the arm, each open and closed, and their weights."""
+  policy, half = heads.policy(), SMALL.policy_samples // 2
+  drawn = policy.sample(key, half)
+  samples = jnp.concatenate([drawn.at[..., 6].set(x) for x in (0.0, 1.0)])
+  close = special.expit(policy.gripper_logits[:, 0])
+  return samples, np.repeat(np.stack([1.0 - close, close]), half, axis=0) / half
+
+
+def of_good(heads: Heads, actions: Array, key: Array):
+  """The replayed actions; the weight is one where they are no worse than pi."""
+  samples, weights = of_pi(heads, key)
+  q, q_pi = values(heads, actions[None])[0], values(heads, samples)
+  good = [float(q[i] - weights[:, i] @ q_pi[:, i] >= 0.0) for i in range(BATCH)]
+  assert set(good) == {0.0, 1.0}  # Else this batch would tell nothing.
+  return actions[None], np.array([good])
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_no_batch_makes_a_number_that_is_none(name: str):
-  """A hundred updates on rewards of 1e6 and images and states far from any seen."""
-  config = dataclasses.replace(CONFIG, algorithm=name)
-  agent = make_agent(config)
-  batch = random_batch(2, BATCH, pixels=True, windows=config.n_step)
-  state = agent.init(jax.random.key(0), batch.observation_tm1)
+def test_losses_are_those_of_the_candidates_that_the_row_names(name: str):
+  example, columns = example_of(name), COLUMNS[name]
+  heads, (_, metrics) = example.heads(example.trained), example.learn(example.batch)[1]
+  prior = regulariser_of(name, heads, example.heads(example.slow))
+  entropy = prior.entropy_bound()
+  assert metrics["prior/entropy"] == pytest.approx(float(entropy.mean()), rel=1e-4)
+  expected = {}
+  candidates = {"q": of_q(heads, prior, KEY)}
+  if columns.policy == "pi":
+    policy = heads.policy()
+    candidates["pi"] = samples, weights = of_pi(heads, KEY)
+    log_pi, q = log_prob(policy, samples), values(heads, samples)
+    kl = np.sum(weights * (log_pi - log_prob(prior, samples)), axis=0)
+    reverse = heads.alpha() * kl - np.sum(weights * q, axis=0)
+    samples, weights = candidates["q"]
+    forward = -np.sum(weights * log_prob(policy, samples), axis=0)
+    expected["loss/policy"] = {"forward": forward, "reverse": reverse}[columns.kl]
+  if columns.fitted_to == "good":
+    candidates["good"] = of_good(heads, example.batch.action_tm1, KEY)
+  if columns.fitted_to:
+    samples, weights = candidates[columns.fitted_to]
+    fit = -np.sum(weights * log_prob(prior, samples), axis=0)
+    expected["loss/m"] = fit - NU * entropy
+  assert set(expected) == set(metrics) & {"loss/m", "loss/policy"}
+  for loss, value in expected.items():
+    assert metrics[loss] == pytest.approx(float(np.mean(value)), rel=1e-3), loss
 
-  def adversarial(batch, key):
-    """All leaves scaled by a random power of ten, images black or white."""
-    scale = 10.0 ** jax.random.uniform(key, minval=-3.0, maxval=6.0)
-    white = jnp.where(jax.random.bernoulli(key), 255, 0).astype(jnp.uint8)
 
-    def change(path, leaf):
-      if leaf.dtype == jnp.uint8:
-        return jnp.full_like(leaf, white)
-      kept = ("action", "discount", "weight", "terminated", "truncated")
-      kept_ = any(k in jax.tree_util.keystr(path) for k in kept)
-      return leaf if kept_ else scale * leaf
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_actions_are_those_of_the_policy_that_the_row_names(name: str):
+  example = example_of(name)
+  heads = example.heads(example.trained)
+  key, _ = jax.random.split(KEY)
+  _, info = example.agent.act(
+    example.trained, example.batch.observation_tm1, KEY, False
+  )
+  kind = COLUMNS[name].policy
+  if kind == "cem":
+    expected = np.ones(BATCH)
+  else:
+    drawn = of_pi(heads, key) if kind == "pi" else of_q(heads, heads.prior(), key)
+    expected = 1.0 / np.sum(drawn[1] ** 2, axis=0)
+    assert np.ptp(expected) > 0.1
+  np.testing.assert_allclose(info["ess"], expected, rtol=1e-3)
 
-    return jax.tree_util.tree_map_with_path(change, batch)
 
-  def body(state, key):
-    return agent.update(state, adversarial(batch, key), key)
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_values_are_learnt_as_the_row_names(name: str):
+  """Outputs of the value head, and whether one reward or a window is read."""
+  example, columns = example_of(name), COLUMNS[name]
+  batch, window = example.batch, example.batch.window
+  assert window is not None
+  outputs = example.heads(example.trained).z(batch.action_tm1[None]).shape[-1]
+  timestep = window.timestep.replace(reward=window.timestep.reward - 0.5)
+  others = (
+    batch.replace(reward_t=batch.reward_t - 0.5),
+    batch.replace(window=window.replace(timestep=timestep)),
+  )
+  targets = [example.learn(x)[1][1]["q/target"] for x in (batch, *others)]
+  read = [bool(x < targets[0]) for x in targets[1:]]
+  assert (outputs, *read) == (columns.outputs, not columns.windows, columns.windows)
 
-  @functools.partial(jax.jit, compiler_options=tiny.FAST_COMPILE)
-  def run(state):
-    state, metrics = jax.lax.scan(body, state, jax.random.split(jax.random.key(1), 100))
-    action, info = agent.act(
-      state.params, batch.observation_tm1, jax.random.key(2), False
-    )
-    return state, metrics, action, info
 
-  state, metrics, action, info = run(state)
-  for leaf in jax.tree.leaves((state.params, state.nu, metrics, info)):
-    assert np.all(np.isfinite(leaf))
-  assert action.shape == (BATCH, 7) and np.all(np.abs(action) <= 1.0)
-  assert set(np.unique(action[:, 6])) <= {0.0, 1.0}
-  common = {"q/min", "q/max", "npql/kl_over_eps", "npql/ess", "npql/alpha_mean"}
-  common |= {"prior/entropy", "policy/entropy", "prior/nu", "q/data", "q/target"}
-  common |= {f"grad_norm/{group}" for group in state.params}
-  assert common <= set(metrics)
+def test_past_policy_is_that_of_the_target_network():
+  example = example_of("mpo")
+  heads, slow = example.heads(example.trained), example.heads(example.slow)
+  past = regularisers.previous_policy(heads, slow)
+  jax.tree.map(np.testing.assert_array_equal, past, slow.policy())
+  assert np.all(np.abs(past.mean - heads.policy().mean).max((1, 2)) > 1e-3)

@@ -58,15 +58,6 @@ def test_projection_matches_rlax():
   np.testing.assert_allclose(ours, expected, atol=2e-5)
 
 
-def test_projection_keeps_mass_and_the_mean_of_the_clipped_return():
-  probs, reward, discount = random_case(2)
-  ours = categorical.project(probs, reward, discount, ATOMS)
-  np.testing.assert_allclose(ours.sum(-1), 1.0, atol=1e-5)
-  returns = np.clip(reward[:, None] + discount[:, None] * ATOMS[None], -1.0, 2.0)
-  expected = np.sum(np.asarray(probs) * returns, axis=-1)
-  np.testing.assert_allclose(categorical.mean(ours, ATOMS), expected, atol=1e-5)
-
-
 def test_projection_of_an_unmoved_distribution_is_itself():
   probs, reward, _ = random_case(3)
   ours = categorical.project(probs, 0.0 * reward, 0.0 * reward + 1.0, ATOMS)

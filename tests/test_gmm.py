@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from densities import scipy_log_prob
 import distrax
 import jax
 import jax.numpy as jnp
@@ -31,22 +32,6 @@ def random_gmm(
     scale_tril=jnp.asarray(scale, jnp.float32),
     gripper_logits=jnp.asarray(2.0 * rng.normal(size=(*batch, num)), jnp.float32),
   )
-
-
-def scipy_log_prob(mixture: GripperGMM, actions: np.ndarray) -> np.ndarray:
-  """Of one unbatched mixture; actions [S, D + 1]."""
-  log_weights = special.log_softmax(np.asarray(mixture.logits, np.float64))
-  parts = []
-  for k, log_weight in enumerate(log_weights):
-    scale = np.asarray(mixture.scale_tril[k], np.float64)
-    arm = stats.multivariate_normal(np.asarray(mixture.mean[k]), scale @ scale.T)
-    gripper = stats.bernoulli(special.expit(float(mixture.gripper_logits[k])))
-    parts.append(
-      log_weight
-      + arm.logpdf(actions[:, :-1])
-      + gripper.logpmf(np.round(actions[:, -1]))
-    )
-  return special.logsumexp(parts, axis=0)
 
 
 def test_log_prob_matches_scipy_for_every_batch_element():

@@ -115,6 +115,26 @@ def test_transitions_of_weight_zero_change_nothing(state, update):
   )
 
 
+def test_an_update_sees_a_batch_without_order(state, update):
+  """What is drawn for a state depends on its place: so no candidate of the target's
+  may be worth more than another here."""
+  z = dict(state.target_params["z"])
+  z["action"] = jax.tree.map(jnp.zeros_like, z["action"])
+  z["out"] = z["out"] | {"kernel": 1000.0 * z["out"]["kernel"]}
+  state = state.replace(target_params=state.target_params | {"z": z})
+  batch, order = random_batch(9), np.random.default_rng(0).permutation(BATCH)
+  batch = batch.replace(weight=jnp.linspace(0.1, 1.0, BATCH))
+  mixed = jax.tree.map(lambda x: x[order], batch)
+  apart = batch.replace(observation_t=mixed.observation_t)
+  one, two, other = (
+    update(state, x, jax.random.key(0))[1] for x in (batch, mixed, apart)
+  )
+  for name in ("loss/q", "loss/ap", "ap/error", "q/data", "q/target"):
+    np.testing.assert_allclose(one[name], two[name], rtol=1e-5, err_msg=name)
+  # The states to bootstrap from do count, and belong to theirs.
+  assert abs(one["loss/q"] - other["loss/q"]) > 1e-3 * one["loss/q"]
+
+
 def test_update_is_deterministic_and_follows_its_key(state, update):
   batch = random_batch(4)
   first, again, other = (

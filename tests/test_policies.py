@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 from batches import random_batch
 import jax
@@ -77,6 +78,29 @@ def test_cross_entropy_method_comes_nearer_than_its_first_draw(heads):
   assert np.all(chosen[:, 6] == 1.0)
   # As many draws without a refit find less.
   assert np.mean(best.value) > np.mean(one.q_values.max(0)) + 0.1
+
+
+def test_cross_entropy_method_is_that_of_qt_opt(heads):
+  """Two draws of 64 and a refit to the 6 best in between, one state at a time."""
+  prior, keys = heads.prior(), jax.random.split(jax.random.key(6), 2)
+  found = policies.cross_entropy(heads, prior, jax.random.key(6), num_samples=0)
+  first = np.asarray(prior.sample(keys[0], 64), np.float64)
+  mean, std, close = [], [], []
+  for draws in np.moveaxis(first, 1, 0):
+    arm = np.clip(draws[:, :6], -1.0, 1.0)
+    q = 1.0 - np.sum((arm - heads.goal) ** 2, axis=-1) + 0.5 * draws[:, 6]
+    best = np.argsort(q)[-6:]
+    mean.append(arm[best].mean(0))
+    std.append(arm[best].std(0).clip(0.01))
+    close.append(draws[best, 6].mean().clip(0.001, 0.999))
+  base: Any = found.base
+  np.testing.assert_allclose(base.mean[:, 0], mean, atol=1e-5)
+  expected = np.asarray(std)[..., None] * np.eye(6)
+  np.testing.assert_allclose(base.scale_tril[:, 0], expected, atol=1e-5)
+  np.testing.assert_allclose(
+    jax.nn.sigmoid(base.gripper_logits[:, 0]), close, atol=1e-5
+  )
+  np.testing.assert_array_equal(found.samples, base.sample(keys[1], 64))
 
 
 def test_uniform_box_is_uniform():

@@ -9,6 +9,7 @@ import numpy as np
 
 from apnpql_jax.agents import objectives
 from apnpql_jax.dists import boltzmann, categorical
+from apnpql_jax.dists.gmm import GripperGMM
 
 SAMPLES, BATCH, BINS = 12, 3, 11
 ATOMS = categorical.support(v_min=-1.0, v_max=2.0, num_atoms=BINS)
@@ -46,7 +47,7 @@ def test_weights_are_a_distribution_that_no_shift_changes(q, alpha, shift):
 @given(q=Q, alpha=ALPHA)
 def test_a_colder_policy_is_farther_from_the_prior_and_worth_more(q, alpha):
   """From the plain mean of the candidates at one end to the best at the other."""
-  weights = [weigh(q, np.float32(f) * alpha) for f in (1e4, 1.0, 0.5, 1e-5)]
+  weights = [weigh(q, np.float32(f) * alpha) for f in (1e5, 1.0, 0.5, 1e-5)]
   values = [q.mean(0), *(np.sum(w * q, axis=0) for w in weights), q.max(0)]
   kls = [np.zeros(BATCH), *map(kl_to_prior, weights), np.log([SAMPLES] * BATCH)]
   assert np.all(np.diff(values, axis=0) > -1e-4)
@@ -54,6 +55,12 @@ def test_a_colder_policy_is_farther_from_the_prior_and_worth_more(q, alpha):
   np.testing.assert_allclose(values[1], values[0], atol=0.1)
   # Candidates that are within 1e-4 of the best need not be told apart.
   np.testing.assert_allclose(values[-2], values[-1], atol=1e-3)
+  sizes = [np.asarray(boltzmann.effective_sample_size(w)) for w in weights]
+  assert np.all(np.diff(sizes, axis=0) < 1e-3)
+  np.testing.assert_allclose(weights[0], 1.0 / SAMPLES, rtol=2e-3)
+  np.testing.assert_allclose(sizes[0], SAMPLES, rtol=1e-4)
+  best = np.sum(q > q.max(0) - 0.01, axis=0)
+  assert np.all(sizes[-1] > 1.0 - 1e-5) and np.all(sizes[-1] < best + 1e-3)
 
 
 @settings(max_examples=60, deadline=None)
@@ -71,7 +78,30 @@ def test_projection_keeps_mass_and_the_clipped_mean(logits, reward, discount):
   np.testing.assert_allclose(projected.sum(-1), 1.0, atol=1e-5)
   moved = np.clip(reward[:, None] + discount[:, None] * np.asarray(ATOMS), -1.0, 2.0)
   expected = np.sum(probs * moved, axis=-1)
-  np.testing.assert_allclose(projected @ ATOMS, expected, atol=1e-4)
+  np.testing.assert_allclose(categorical.mean(projected, ATOMS), expected, atol=1e-4)
+
+
+@jax.jit
+def losses_of(draws: dict, states: dict) -> dict:
+  """Every formula of the learner, f32[6, ...] each, by what it is called."""
+  q, samples, alpha = draws["q"], draws["samples"], states["alpha"]
+  weights = boltzmann.importance_weights(q, alpha)
+  target = objectives.value_target(
+    draws["logits"], weights, states["reward"], states["discount"], ATOMS
+  )
+  kl, steps = boltzmann.kl_to_prior(weights), states["steps"]
+  prior, nu = states["prior"], jnp.float32(0.3)
+  return {
+    "target": target,
+    "q": objectives.q_loss(states["logits"], target),
+    "ap": objectives.ap_loss(states["predicted"], states["label"], delta=0.1),
+    "retrace": objectives.retrace_target(*jnp.moveaxis(steps, -1, 0)),
+    "alpha": objectives.alpha_loss(q, alpha, epsilon=1.0),
+    "kl": objectives.kl_dual(kl, alpha, epsilon=1.0),
+    "policy": objectives.weighted_nll(prior, samples, weights),
+    "m": objectives.m_step_loss(prior, samples, weights, nu),
+    "nu": objectives.nu_loss(nu, prior.entropy_bound(), epsilon_nu=-1.0),
+  }
 
 
 @settings(max_examples=20, deadline=None)
@@ -86,22 +116,35 @@ def test_states_do_not_see_each_other_and_candidates_have_no_order(order, pace, 
   def draw(*shape: int) -> jax.Array:
     return jnp.asarray(rng.normal(size=shape), jnp.float32)
 
-  logits, q, reward = draw(SAMPLES, 6, BINS), draw(SAMPLES, 6), draw(6)
-  alpha, discount = jnp.exp(draw(6)), jax.nn.sigmoid(draw(6))
-
-  def both(logits, q, alpha, reward, discount):
-    weights = boltzmann.importance_weights(q, alpha)
-    target = objectives.value_target(logits, weights, reward, discount, ATOMS)
-    return target, objectives.alpha_loss(q, alpha, epsilon=1.0)
-
-  whole = both(logits, q, alpha, reward, discount)
-  states, turn = np.array(order), np.array(pace)
-  mixed = both(
-    logits[turn][:, states],
-    q[turn][:, states],
-    alpha[states],
-    reward[states],
-    discount[states],
+  below = 0.3 * draw(6, 3, 2, 2)
+  prior = GripperGMM(
+    logits=draw(6, 3),
+    mean=draw(6, 3, 2),
+    scale_tril=jnp.tril(below, -1) + jnp.eye(2) * jnp.exp(draw(6, 3, 2, 1)),
+    gripper_logits=draw(6, 3),
   )
-  for a, b in zip(whole, mixed, strict=True):
-    np.testing.assert_allclose(np.asarray(a)[states], b, rtol=1e-4, atol=1e-5)
+  samples = draw(SAMPLES, 6, 3)
+  draws = {
+    "q": draw(SAMPLES, 6),
+    "logits": draw(SAMPLES, 6, BINS),
+    "samples": samples.at[..., -1].set(samples[..., -1] > 0.0),
+  }
+  states = {
+    "alpha": jnp.exp(draw(6)),
+    "reward": draw(6),
+    "discount": jax.nn.sigmoid(draw(6)),
+    "logits": draw(6, BINS),
+    "predicted": draw(6, 3, 7),
+    "label": jax.nn.sigmoid(draw(6, 3, 7)),
+    "steps": draw(6, 4, 5),
+    "prior": prior,
+  }
+  turn, places = np.array(pace), np.array(order)
+  mixed = losses_of(
+    jax.tree.map(lambda x: x[turn][:, places], draws),
+    jax.tree.map(lambda x: x[places], states),
+  )
+  for name, whole in losses_of(draws, states).items():
+    np.testing.assert_allclose(
+      np.asarray(whole)[places], mixed[name], rtol=1e-4, atol=1e-4, err_msg=name
+    )

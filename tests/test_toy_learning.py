@@ -235,8 +235,15 @@ def test_agent_learns_to_carry_the_object_to_the_goal():
   assert jnp.mean(metrics["npql/kl_over_eps"][-50:]) > 0.7
 
 
+SLOW = [("abm_mpo", 1.5), ("svg_prior", 6.0), ("mpo", 1.5), ("ap_cem", 1.5)]
+
+
 @pytest.mark.parametrize(
-  ("algorithm", "epsilon"), [("ap_mpo", 1.5), ("ap_sac", 6.0), ("sac", 8.0)]
+  ("algorithm", "epsilon"),
+  [
+    *[("ap_mpo", 1.5), ("ap_sac", 6.0), ("sac", 8.0)],
+    *(pytest.param(*row, marks=pytest.mark.slow) for row in SLOW),
+  ],
 )
 def test_every_algorithm_of_the_paper_learns_half_of_the_task(algorithm, epsilon):
   """The object is in the hand from the start: keep it, and find the goal."""
@@ -251,6 +258,7 @@ def test_every_algorithm_of_the_paper_learns_half_of_the_task(algorithm, epsilon
     num_atoms=21,
     learning_rate_alpha=3e-4,
   )
-  before, after, _ = learn(config, 200, held=True)
+  # Without a prior of its own MPO begins far from the primitives.
+  before, after, _ = learn(config, 400 if algorithm == "mpo" else 200, held=True)
   assert before < 0.1
   assert after > 0.8
