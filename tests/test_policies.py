@@ -6,10 +6,12 @@ import dataclasses
 from typing import Any
 
 from batches import random_batch
+from densities import scipy_log_prob
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import special
 
 from apnpql_jax.agents import policies, projections
 from apnpql_jax.agents.evaluation import TD0
@@ -121,6 +123,19 @@ def test_reverse_kl_of_a_gaussian_and_a_uniform_prior_is_exact(heads):
   step = projections.reverse_kl(heads, UniformBox((STATES,), 6), jax.random.key(4))
   expected = 7.0 * np.log(2.0) - heads.policy().entropy_bound()
   assert np.mean(step.kl - expected) == pytest.approx(0.0, abs=0.1)
+
+
+def test_reverse_kl_tells_the_weights_of_q_on_draws_of_pi(heads):
+  prior, policy, alpha = heads.prior(), heads.policy(), np.asarray(heads.alpha())
+  step = projections.reverse_kl(heads, prior, jax.random.key(5))
+  pi = step.candidates
+  for state in range(3):
+    one = jax.tree.map(lambda x, state=state: x[state], (prior, policy))
+    actions = np.asarray(pi.samples[:, state], np.float64)
+    log_b, log_pi = (scipy_log_prob(mixture, actions) for mixture in one)
+    q = np.asarray(pi.q_values[:, state]) / alpha[state]
+    expected = special.softmax(log_b + q - log_pi + np.log(pi.weights[:, state]))
+    np.testing.assert_allclose(step.weights[:, state], expected, rtol=1e-2, atol=1e-5)
 
 
 @pytest.mark.parametrize("project", [projections.forward_kl, projections.reverse_kl])
