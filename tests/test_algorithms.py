@@ -195,7 +195,9 @@ def test_losses_are_those_of_the_candidates_that_the_row_names(name: str):
     forward = -np.sum(weights * log_prob(policy, samples), axis=0)
     expected["loss/policy"] = {"forward": forward, "reverse": reverse}[columns.kl]
   if columns.fitted_to == "good":
-    candidates["good"] = of_good(heads, example.batch.action_tm1, KEY)
+    # By draws of its own, not those of the policy update.
+    key = jax.random.fold_in(KEY, 1)
+    candidates["good"] = of_good(heads, example.batch.action_tm1, key)
   if columns.fitted_to:
     samples, weights = candidates[columns.fitted_to]
     fit = -np.sum(weights * log_prob(prior, samples), axis=0)
