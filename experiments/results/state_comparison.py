@@ -107,21 +107,15 @@ def train(task: str, row: str, seed: int) -> None:
   command, path = command_of(task, row, seed), path_of(task, row, seed)
   with tempfile.TemporaryDirectory() as folder:
     run = Path(folder) / "run"
-    with (Path(folder) / "said.txt").open("w") as said:
-      apnpql = [sys.executable, "-m", "apnpql_jax"]
-      subprocess.run([*apnpql, *command, "--run", str(run)], check=True, stderr=said)
-      play = f"--episodes {EPISODES} --seed {EPISODES_SEED} --json".split()
-      done = subprocess.run(
-        [*apnpql, "evaluate", str(run), *play],
-        check=True,
-        stdout=subprocess.PIPE,
-        stderr=said,
-      )
+    apnpql = [sys.executable, "-m", "apnpql_jax"]
+    subprocess.run([*apnpql, *command, "--run", str(run)], check=True)
+    play = f"--episodes {EPISODES} --seed {EPISODES_SEED} --json".split()
+    final = subprocess.check_output([*apnpql, "evaluate", str(run), *play])
     result = {
       "command": command,
       "versions": json.loads(open_run(run).versions.read_text()),
       "config": json.loads((run / "config.json").read_text()),
-      "final": json.loads(done.stdout),
+      "final": json.loads(final),
       "evaluations": evaluations(open_run(run)),
     }
   part = path.with_suffix(".part")
