@@ -71,7 +71,7 @@ def test_parametric_policy_sums_over_the_gripper(heads):
 
 def test_cross_entropy_method_comes_nearer_than_its_first_draw(heads):
   prior = UniformBox((STATES,), 6)
-  best = policies.cross_entropy(heads, prior, jax.random.key(3), num_samples=0)
+  best = policies.cem(heads, prior, jax.random.key(3), num_samples=0)
   one = policies.non_parametric(heads, prior, jax.random.key(3), num_samples=128)
   assert best.samples.shape == (64, STATES, 7)
   np.testing.assert_array_equal(best.weights.sum(0), 1.0)
@@ -85,7 +85,7 @@ def test_cross_entropy_method_comes_nearer_than_its_first_draw(heads):
 def test_cross_entropy_method_is_that_of_qt_opt(heads):
   """Two draws of 64 and a refit to the 6 best in between, one state at a time."""
   prior, keys = heads.prior(), jax.random.split(jax.random.key(6), 2)
-  found = policies.cross_entropy(heads, prior, jax.random.key(6), num_samples=0)
+  found = policies.cem(heads, prior, jax.random.key(6), num_samples=0)
   first = np.asarray(prior.sample(keys[0], 64), np.float64)
   mean, std, close = [], [], []
   for draws in np.moveaxis(first, 1, 0):

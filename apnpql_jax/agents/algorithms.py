@@ -17,12 +17,7 @@ from apnpql_jax.agents.evaluation import (
   Retrace,
 )
 from apnpql_jax.agents.networks import GROUPS
-from apnpql_jax.agents.policies import (
-  Candidates,
-  cross_entropy,
-  non_parametric,
-  parametric,
-)
+from apnpql_jax.agents.policies import Candidates, cem, non_parametric, parametric
 from apnpql_jax.agents.projections import Improvement, forward_kl, none, reverse_kl
 from apnpql_jax.agents.regularisers import (
   Losses,
@@ -92,7 +87,7 @@ ALGORITHMS = {
     uniform,         parametric,     no_update,        reverse_kl, ClippedDoubleQ,
   ),
   "ap_cem": Algorithm(
-    behaviour_prior, cross_entropy,  fit_candidates,   none,       ClippedDoubleQ,
+    behaviour_prior, cem,            fit_candidates,   none,       ClippedDoubleQ,
   ),
 }  # fmt: skip
 """The last row is not in the table: QT-Opt's policy, for b with action primitives."""

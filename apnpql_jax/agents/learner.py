@@ -44,7 +44,9 @@ class Agent:
   """(params, observation [B], key, greedy) -> actions f32[B, 7], info f32[B] each.
 
   The policy's candidates are drawn, and one is picked by its weights, or, if greedy
-  (a Python bool), the one of highest value."""
+  (a Python bool), the one of highest value. Info has the action's log_prob, which
+  Retrace needs, and for a look at a policy its q, q_max and ess of the candidates,
+  and alpha."""
 
   update: Callable[[LearnerState, Transition, Array], tuple[LearnerState, Metrics]]
   """(state, transitions [B], key) -> state after one update, metrics f32[]."""

@@ -111,7 +111,7 @@ def parametric(
   )
 
 
-def cross_entropy(
+def cem(
   heads: Heads, prior: ActionDistribution, key: Array, *, num_samples: int
 ) -> Candidates:
   """The best action that the cross-entropy method finds (QT-Opt), from draws of b.
