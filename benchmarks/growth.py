@@ -4,7 +4,8 @@
   python benchmarks/growth.py --store --axes worlds --worlds 1 16 256
 
 On push_plate, but for contacts: there place_plate, which has the most, loses more and
-more of its contact pairs. Sizes for which the memory does not suffice are left out.
+more of its contact pairs, and has a slot for every point of the others. Sizes for which
+the memory does not suffice are left out.
 ``--json`` prints one JSON object and nothing else.
 """
 
@@ -224,6 +225,7 @@ def _replay(config: TrainConfig, count: int, *, repeats: int) -> Timed:
 
 
 def _keep_pairs(count: int, spec: mujoco.MjSpec) -> None:
+  spec.delete(spec.numeric("max_contact_points"))
   for pair in list(spec.pairs)[count:]:
     spec.delete(pair)
 

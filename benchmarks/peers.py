@@ -27,6 +27,7 @@ import apnpql_jax  # noqa: F401  isort: skip  (before JAX: sets threads and cach
 import sides
 import tables
 
+from apnpql_jax import runtime
 from apnpql_jax.presets import preset_names
 from apnpql_jax.tasks import task_names
 
@@ -142,7 +143,9 @@ def compare(
 ) -> Iterator[dict[str, Any]]:
   """Ratios of one peer, or a line that says why there are none."""
   peer = PEERS[name]
-  env = {"MUJOCO_GL": graphics()} if peer.draws else {}
+  env = {"XLA_FLAGS": runtime.fusions_flag(*runtime.KEPT_FUSIONS, "REDUCE")}
+  if peer.draws:
+    env["MUJOCO_GL"] = graphics()
   settings = sizes | peer.settings
   try:
     with sides.Side(peer.script, settings, env=env, limit_s=args.limit) as theirs:

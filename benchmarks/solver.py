@@ -1,9 +1,10 @@
-"""How few solver iterations the tasks can bear: the sweep behind mjcf/robot.xml.
+"""How few solver iterations and contacts the tasks can bear: the sweeps behind mjcf.
 
   python benchmarks/solver.py --episodes 64           # half an hour on two cores
-  python benchmarks/solver.py --tasks flip_cup --settings 20x20 10x10
+  python benchmarks/solver.py --tasks flip_cup --settings 20x20 10x10 10x10x16
 
-A setting is ITERATIONSxLS_ITERATIONS. For each, the scripted expert plays held-out
+A setting is ITERATIONSxLS_ITERATIONS, or that and xMAX_CONTACT_POINTS (of MJX, of each
+condim), which is the scene's if left out. For each, the scripted expert plays held-out
 episodes on one engine, and the scene's speed is measured. Adds to results/solver.json
 beside this file, in place of what was there for the same task, engine and setting.
 """
@@ -26,7 +27,7 @@ from apnpql_jax.rollout import expert_policy
 from apnpql_jax.tasks import make_task, task_names
 
 RESULT = Path(__file__).resolve().parent / "results" / "solver.json"
-SETTINGS = ["20x20", "10x10", "5x10", "5x5", "3x10"]
+SETTINGS = ["20x20", "10x10", "5x10", "5x5", "3x10", "10x10x999", "10x10x16", "10x10x8"]
 
 
 def main() -> None:
@@ -41,29 +42,27 @@ def main() -> None:
   results = json.loads(RESULT.read_text()) if RESULT.exists() else {}
   for task in args.tasks:
     for setting in args.settings:
-      iterations, ls_iterations = map(int, setting.split("x"))
-      figures = measure(task, args.backend, iterations, ls_iterations, args.episodes)
+      figures = measure(task, args.backend, setting, args.episodes)
       name = f"{task} {args.backend} {setting}"
       print(name, figures, flush=True)
       results[name] = figures
       RESULT.write_text(json.dumps(results, indent=2, sort_keys=True) + "\n")
 
 
-def measure(
-  name: str, backend: str, iterations: int, ls_iterations: int, episodes: int
-) -> dict[str, float]:
+def measure(name: str, backend: str, setting: str, episodes: int) -> dict[str, float]:
   """The expert's successes and the physics steps per second under one setting."""
   task = make_task(name)
   config = EnvConfig(task=name, backend=backend, obs="state")
   bank, _ = load_bank(task, config.bank_rows)  # As shipped: the same resets for all.
   model = task.scene.model
+  iterations, ls_iterations, *contacts = map(int, setting.split("x"))
   model.opt.iterations = iterations
   model.opt.ls_iterations = ls_iterations
   model.numeric("mjx_ls_iterations").data[:] = ls_iterations
+  if contacts:
+    model.numeric("max_contact_points").data[:] = contacts
   # Otherwise C MuJoCo would be called as it was first set up for this scene.
-  task.scene = dataclasses.replace(
-    task.scene, fingerprint=f"{iterations}x{ls_iterations}"
-  )
+  task.scene = dataclasses.replace(task.scene, fingerprint=setting)
   env = Env(config, task, bank)
   play = make_player(env, lambda _: expert_policy(env, noise=0.0))
   figures = play_held_out(env, play, None, episodes=episodes, seed=0)

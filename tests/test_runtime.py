@@ -18,6 +18,7 @@ NAMES = (
   "PJRT_NPROC",
   "JAX_COMPILATION_CACHE_DIR",
   "JAX_DEFAULT_MATMUL_PRECISION",
+  "XLA_FLAGS",
 )
 
 
@@ -67,9 +68,30 @@ def test_what_the_user_sets_is_kept(tmp_path):
     "JAX_COMPILATION_CACHE_DIR": str(tmp_path),
     "JAX_DEFAULT_MATMUL_PRECISION": "float32",
     "NPROC": "6",
+    "XLA_FLAGS": runtime.fusions_flag("INDIVIDUAL_DOT", "REDUCE"),
   }
   env = settings(**given)
   assert {name: env[name] for name in given} == given
+
+
+def test_sums_stay_inside_xla_beside_what_the_user_asks_of_it():
+  code = "print(jax.jit(lambda x: (x * x).sum(1)).lower(jax.numpy.ones((32, 64, 3)))"
+  fused = [
+    "ynn_fusion" in run(f"import {names}; {code}.compile().as_text())", **flags)
+    for names, flags in (
+      ("jax", {}),
+      ("apnpql_jax, jax", {}),
+      ("jax, apnpql_jax", {"XLA_FLAGS": "--xla_cpu_enable_fast_math=false"}),
+    )
+  ]
+  assert fused == [True, False, False]
+
+
+def test_an_xla_that_may_not_know_a_flag_is_not_given_it(monkeypatch):
+  monkeypatch.delenv("XLA_FLAGS", raising=False)
+  monkeypatch.setattr(runtime.metadata, "version", lambda _: "0.12.0")
+  runtime.configure()
+  assert "XLA_FLAGS" not in os.environ
 
 
 def test_cache_lies_in_the_cache_folder_of_the_user(tmp_path):

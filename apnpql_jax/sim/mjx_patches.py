@@ -54,7 +54,8 @@ def _update_gradient(m, d, ctx):
     first, last = addresses[chosen[0]], addresses[chosen[-1]] + dim
     cones = ctx.h[chosen[0] : chosen[-1] + 1, :dim, :dim]
     rows = jacobian[first:last].reshape(len(chosen), dim, -1)
-    added = jnp.einsum("cij,cjv->civ", cones, rows)
+    # Not a product of matrices: XLA:CPU calls one for each of these small blocks.
+    added = jnp.sum(cones[..., None] * rows[:, None], axis=2)
     weighted = weighted.at[first:last].add(added.reshape(last - first, -1))
   hessian = mjx.full_m(m, d) + jacobian.T @ weighted
   factor = jax.scipy.linalg.cho_factor((hessian + hessian.T) / 2)
