@@ -41,6 +41,7 @@ FULL: dict[str, Any] = {
   "matrix": 8192,
   "engines": [
     "jax, cones",
+    "jax, cones, all contacts",
     "jax, barrier and cones",
     "jax, barrier",
     "jax, stock",

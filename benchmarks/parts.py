@@ -93,7 +93,7 @@ def shares(whole_s: float, parts: dict[str, float]) -> dict[str, float]:
   """Each part's share of the whole, and the rest's; parts may add up to more."""
   total = max(whole_s, sum(parts.values()))
   found = {name: seconds / total for name, seconds in parts.items()}
-  return found | {"rest": max(0.0, 1.0 - sum(found.values()))}
+  return found | {"rest": (total - sum(parts.values())) / total}
 
 
 def physics_work(engine: Physics, state: PhysicsState) -> floor.Work:

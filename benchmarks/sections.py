@@ -284,6 +284,7 @@ def spread(result: dict[str, Any], name: str) -> str:
 
 def percent(share: float) -> str:
   """A share, with two digits that count where it is small."""
+  share = round(share, 6)  # What rounding leaves is none.
   return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"
 
 
