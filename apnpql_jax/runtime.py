@@ -88,7 +88,8 @@ def _set_threads() -> None:
 
 def _keep_sums() -> None:
   # The sums of MJX's line search are so small that handing them over takes longer than
-  # adding up: a step of physics then takes 1.3 to 1.8 times as long, an update 1.2.
+  # adding up: a step of physics then takes 1.3 to 1.8 times as long. Updates of the
+  # presets gain too, while those of batch 32 with 30 candidates lose 8 %.
   flags = os.environ.get("XLA_FLAGS", "")
   flag = fusions_flag(*KEPT_FUSIONS)
   if flag and _FLAG not in flags:
