@@ -88,6 +88,17 @@ def exclude(replay: Replay, steps: Array) -> Replay:
   return replay.replace(slots=slots)
 
 
+@jax.jit
+def episodes(replay: Replay) -> tuple[Array, Array]:
+  """Episodes whose end is held, i32[]: those that ended in success, and all.
+
+  One that is excluded, all slots of which are last, counts once.
+  """
+  timestep = replay.slots.timestep
+  ends = timestep.last & ~jnp.roll(timestep.last, 1, axis=0)
+  return jnp.sum(ends & timestep.terminated), jnp.sum(ends)
+
+
 def can_sample(replay: Replay, *, n_step: int) -> Array:
   """bool[]: a slot with ``n_step`` slots after it is held."""
   return replay.size > n_step

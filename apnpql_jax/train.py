@@ -23,6 +23,7 @@ from apnpql_jax import (
   faults,
   leaves,
   memory,
+  replay,
   resuming,
   run_folder,
   runs,
@@ -184,6 +185,9 @@ def _start(
     state = resuming.restore(config, run_dir, example, _say)
     return Start(env, agent, folder, state, int(state.env_steps))
   state = initial_state(config, env, agent, _expert(config, env))
+  if state.expert_replay is not None:
+    solved, ended = map(int, replay.episodes(state.expert_replay))
+    _say(f"the expert's replay: {solved} of {ended} episodes solved")
   if resume:
     _say("it was stopped before its first checkpoint, and begins again")
     return Start(env, agent, folder, state, 0)

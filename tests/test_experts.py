@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from apnpql_jax.config import EnvConfig
+from apnpql_jax.config import EnvConfig, ReplayConfig
 from apnpql_jax.env import HISTORY, Env, EnvState, make_env
 from apnpql_jax.evaluate import make_player, play_held_out
 from apnpql_jax.rollout import expert_policy
@@ -44,8 +44,10 @@ def env(request) -> Env:
   return make_env(EnvConfig(task=task, obs="state", backend=backend, bank_rows=ROWS))
 
 
-def test_the_expert_solves_its_task(env):
-  player = make_player(env, lambda _: expert_policy(env, noise=0.0))
+@pytest.mark.parametrize("noise", [0.0, ReplayConfig().expert_noise])
+def test_the_expert_solves_its_task(env, noise: float):
+  """As it is, and with the noise by which it fills the replay of training."""
+  player = make_player(env, lambda _: expert_policy(env, noise=noise))
   figures = play_held_out(env, player, None, episodes=32, seed=0)
   assert figures["successes"] >= 31
 

@@ -244,6 +244,16 @@ def test_neither_transition_nor_window_reaches_an_excluded_episode():
     assert np.isfinite(leaf[drawn]).all()
 
 
+def test_episodes_are_counted_at_their_ends():
+  """The first world solves two and runs out of time in one; the second one's episode
+  is excluded, every slot of it."""
+  stream = _stream(12, WORLDS, end_rate=0.0, seed=0)
+  stream.timestep.terminated[[2, 9], 0] = True
+  stream.timestep.truncated[6, 0] = True
+  replay = rb.exclude(_fill(stream, length=12, chunk=4), jnp.asarray([0, 5]))
+  assert [int(x) for x in rb.episodes(replay)] == [2, 4]
+
+
 def test_rewards_worked_by_hand():
   stream = _stream(6, 1, 0.0, seed=0)
   step = dataclasses.replace(
