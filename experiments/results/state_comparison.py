@@ -30,7 +30,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 from summarize import GOAL
 
+from apnpql_jax.config import TrainConfig, config_diff, config_from_json, format_diff
 from apnpql_jax.metrics import read_rows, wilson_interval
+from apnpql_jax.options import Train, parse
+from apnpql_jax.presets import load_preset
 from apnpql_jax.run_folder import RunFolder, open_run
 
 OUT = Path(__file__).resolve().with_suffix("")
@@ -47,19 +50,22 @@ class Row(NamedTuple):
   """Times the environment steps of the others."""
 
 
+SAC = "--agent.epsilon 10 --agent.min-alpha 0.001"
+
 ROWS = {
   "ap_npql": Row("ap_npql"),
   # Parametric policies start as narrow as the prior is at its widest.
   "ap_mpo": Row("ap_mpo", "--agent.policy-initial-std 0.05"),
   # Reverse KL. From a wider policy, KL to the narrow prior begins at 200 epsilon.
   "ap_sac": Row("ap_sac", "--agent.epsilon 6 --agent.policy-initial-std 0.05"),
-  # A uniform prior: 4.85 - epsilon is the floor on the policy's entropy.
-  "sac": Row("sac", "--agent.epsilon 14"),
+  # A uniform prior: 4.85 - epsilon is the floor on the policy's entropy, and at the
+  # presets' floor on alpha a nat of it is worth a period of discount.
+  "sac": Row("sac", SAC),
   # Nothing of the primitives, neither as a prior nor as an auxiliary loss.
   "npql_without_ap": Row(
     "ap_npql", "--agent.regulariser uniform --agent.lambda-ap 0", budget=10
   ),
-  "sac_without_ap": Row("sac", "--agent.epsilon 14 --agent.lambda-ap 0", budget=10),
+  "sac_without_ap": Row("sac", f"{SAC} --agent.lambda-ap 0", budget=10),
 }
 PAPER = ("ap_npql", "ap_mpo", "ap_sac", "sac")
 
@@ -88,20 +94,26 @@ def path_of(task: str, row: str, seed: int) -> Path:
   return OUT / f"{task}-{row}-{seed}.json"
 
 
-def command_of(task: str, row: str, seed: int) -> list[str]:
-  """The run on the command line, without its folder."""
+def options_of(row: str, seed: int) -> list[str]:
+  """In which a run differs from the preset of its task, on the command line."""
   algorithm, flags, budget = ROWS[row]
-  common = (
-    f"--obs state --seed {seed} --total-steps {budget * STEPS} --no-video "
-    f"--eval-every {budget * STEPS // EVALUATIONS} "
-    f"--agent.target-samples {CANDIDATES} --agent.policy-samples {CANDIDATES}"
+  options = (
+    f"--env.obs state --agent.algorithm {algorithm} --seed {seed} --no-video "
+    f"--total-steps {budget * STEPS} --eval-every {budget * STEPS // EVALUATIONS} "
+    f"--agent.target-samples {CANDIDATES} --agent.policy-samples {CANDIDATES} {flags}"
   )
-  return ["train", task, "--algorithm", algorithm, *common.split(), *flags.split()]
+  return options.split()
+
+
+def config_of(task: str, row: str, seed: int) -> TrainConfig:
+  """The settings of a run."""
+  base = Train(config=load_preset(task))
+  return parse(Train, "train", options_of(row, seed), default=base).config
 
 
 def train(task: str, row: str, seed: int) -> None:
   """One run and its evaluation; the result appears when both are complete."""
-  command, path = command_of(task, row, seed), path_of(task, row, seed)
+  command, path = ["train", task, *options_of(row, seed)], path_of(task, row, seed)
   with tempfile.TemporaryDirectory() as folder:
     run = Path(folder) / "run"
     apnpql = [sys.executable, "-m", "apnpql_jax"]
@@ -136,14 +148,15 @@ def results() -> dict[tuple[str, str], list[Result]]:
   """(task, row) -> results of each seed at hand.
 
   Raises:
-    SystemExit: one of them was made with another command than it would be now.
+    SystemExit: one of them was made with other settings than it would be now.
   """
   found: dict[tuple[str, str], list[Result]] = {}
   for task, row in itertools.product(TASKS, ROWS):
     for path in sorted(OUT.glob(f"{task}-{row}-*.json")):
       result = json.loads(path.read_text())
-      if result["command"] != command_of(task, row, result["config"]["seed"]):
-        sys.exit(f"{path.name} is of other settings; remove it to train it again")
+      was = config_from_json(json.dumps(result["config"]))
+      if changed := config_diff(was, config_of(task, row, was.seed)):
+        sys.exit(f"{path.name}: {format_diff(changed)}; remove it to train it again")
       found.setdefault((task, row), []).append(result)
   return found
 
