@@ -1,19 +1,14 @@
-"""The runs of the comparison from states: their settings can work, budgets are equal."""
+"""The runs of the comparison from states: their settings work, budgets are equal."""
 
 from __future__ import annotations
 
 import itertools
-from pathlib import Path
-import sys
 
 import pytest
+import state_comparison as comparison
 
 from apnpql_jax.agents.algorithms import epsilon_bounds
 from apnpql_jax.config import config_diff, validate
-
-RESULTS = Path(__file__).resolve().parents[1] / "experiments" / "results"
-sys.path.append(str(RESULTS))
-import state_comparison as comparison  # noqa: E402  (a script beside its results)
 
 RUNS = [*itertools.product(comparison.TASKS, comparison.ROWS)]
 
