@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from apnpql_jax.config import EnvConfig
+from apnpql_jax.config import EnvConfig, ReplayConfig
 from apnpql_jax.env import make_env
 from apnpql_jax.rollout import expert_policy
 from apnpql_jax.sim import physics
@@ -26,7 +26,7 @@ FINGERS = range(6, 10)
 def test_a_period_goes_as_with_a_slot_for_every_point(name):
   """From instants all over the expert's episodes: free, gripped, carried, put down."""
   env = make_env(EnvConfig(task=name, backend="native", obs="state", worlds=WORLDS))
-  expert = expert_policy(env, noise=0.03)  # With 0.1 no plate is gripped.
+  expert = expert_policy(env, noise=ReplayConfig().expert_noise)
 
   def period(state, key):
     action, _ = expert(state, key)
