@@ -167,16 +167,19 @@ def plot(found: dict[tuple[str, str], list[Result]]) -> None:
     1, len(TASKS), figsize=(3.4 * len(TASKS), 3.2), sharey=True, layout="constrained"
   )
   for panel, task in zip(panels, TASKS, strict=True):
-    for row in PAPER:
+    for colour, row in enumerate(PAPER):
       if runs := found.get((task, row)):
         curves = [run["evaluations"] for run in runs]
         rates = 100 * np.array([[x["eval/success_rate"] for x in c] for c in curves])
-        steps = [x["step"] for x in curves[0]]
-        panel.plot(steps, rates.mean(0), ".-", label=f"{row} ({len(runs)})")
-        panel.fill_between(steps, rates.min(0), rates.max(0), alpha=0.2)
-    panel.set(title=task, xlabel="environment steps", ylim=(-2, 102))
-    panel.legend()
+        steps = [x["step"] / 1000 for x in curves[0]]
+        panel.plot(steps, rates.mean(0), ".-", color=f"C{colour}", label=row)
+        panel.fill_between(
+          steps, rates.min(0), rates.max(0), color=f"C{colour}", alpha=0.2, linewidth=0
+        )
+    panel.set(title=task, xlabel="1,000 environment steps")
+    panel.set(xlim=(0, STEPS / 1000), ylim=(-2, 102))
   panels[0].set_ylabel("held-out success (%)")
+  panels[0].legend()
   figure.savefig(OUT / "curves.png", dpi=120)
 
 
