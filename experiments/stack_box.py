@@ -16,5 +16,5 @@ CONFIG = dataclasses.replace(
   env=dataclasses.replace(_PUSH.env, task="stack_box"),
   agent=dataclasses.replace(_PUSH.agent, min_prob=0.02),
   replay=dataclasses.replace(_PUSH.replay, capacity=51_200, expert_steps=25_600),
-  total_steps=61_440,
+  total_steps=40_960,
 )

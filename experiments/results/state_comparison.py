@@ -56,8 +56,9 @@ ROWS = {
   "ap_npql": Row("ap_npql"),
   # Parametric policies start as narrow as the prior is at its widest.
   "ap_mpo": Row("ap_mpo", "--agent.policy-initial-std 0.05"),
-  # Reverse KL. From a wider policy, KL to the narrow prior begins at 200 epsilon.
-  "ap_sac": Row("ap_sac", "--agent.epsilon 6 --agent.policy-initial-std 0.05"),
+  # One Gaussian is tens of nats from a narrow mixture, at first hundreds: a limit below
+  # that drives alpha to 1,000, and half of the budget goes by until it is back.
+  "ap_sac": Row("ap_sac", "--agent.epsilon 50 --agent.policy-initial-std 0.05"),
   # A uniform prior: 4.85 - epsilon is the floor on the policy's entropy, and at the
   # presets' floor on alpha a nat of it is worth a period of discount.
   "sac": Row("sac", SAC),
