@@ -34,7 +34,7 @@ class Observation(struct.PyTreeNode):
   tool: Array | None = None  # f32[*b, 3]: tool position by forward kinematics, m
   global_image: Array | None = None  # u8[*b, H, W, 3], EnvConfig.global_size
   wrist_image: Array | None = None  # u8[*b, H, W, 3], EnvConfig.wrist_size
-  objects: Array | None = None  # f32[*b, n]: positions, m, only under --obs state
+  objects: Array | None = None  # f32[*b, 3 k]: k points, m, only under --obs state
 
 
 class TimeStep(struct.PyTreeNode):

@@ -281,6 +281,7 @@ def test_objects_are_the_poses_and_the_shape(task, resets, half):
   objects = np.asarray(task.objects(resets))
   cup = np.asarray(pos(task, resets, "cup"))
   np.testing.assert_allclose(objects[:, :3], cup)
-  np.testing.assert_allclose(objects[:, 3:6], 0 * cup - [0, 0, 0.2], atol=1e-6)
+  np.testing.assert_allclose(objects[:, 3:6], cup - [0, 0, 0.2], atol=1e-6)
   np.testing.assert_allclose(objects[:, 6:9], resets.mocap_pos[:, 0])
-  np.testing.assert_allclose(objects[:, 9:], half, atol=1e-6)
+  corner = np.insert(half, 1, 0.0, axis=-1)  # Half the width, half the height.
+  np.testing.assert_allclose(objects[:, 9:], cup + corner, atol=1e-6)

@@ -185,6 +185,15 @@ def test_robot_inputs_hold_the_newest_state_and_the_changes():
   np.testing.assert_allclose(inputs[26:], 7.0 * 0.3, rtol=1e-5)
 
 
+def test_points_are_seen_from_the_tool_in_detail_where_they_are_near():
+  rng = np.random.default_rng(0)
+  tool, away = rng.normal(size=(2, 5, 3)), rng.normal(0.0, 0.2, (2, 5, 4, 3))
+  points = (tool[:, :, None] + away).reshape(2, 5, 12)
+  expected = np.tanh(away[..., None] / [0.05, 0.2]).reshape(2, 5, 24)
+  seen = encoder.seen_from(jnp.asarray(tool), jnp.asarray(points))
+  np.testing.assert_allclose(seen, expected, atol=1e-5)
+
+
 @pytest.mark.parametrize(
   "pixels, objects", [(True, False), (False, True), (True, True)]
 )

@@ -445,7 +445,7 @@ def test_objects_are_the_poses_of_plate_and_box(task, resets, turn):
   goal, frame = mocap(task, state, "goal")
   plate = goal + frame.apply([0.01, 0.02, 0.3])
   axis, side = (frame * turn).as_matrix()[:, :, 2], frame.as_matrix()[:, :, 0]
-  expected = [plate, 0.2 * axis, goal, 0.2 * side]
+  expected = [plate, plate + 0.2 * axis, goal, goal + 0.2 * side]
   np.testing.assert_allclose(task.objects(state), np.hstack(expected), atol=1e-6)
 
 

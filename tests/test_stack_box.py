@@ -347,7 +347,7 @@ def faces(task, state, body) -> np.ndarray:
   nearest = normals[:, 0].argmax(-1)
   normal = normals[np.arange(len(mat)), :, nearest]
   centre = np.asarray(pos(task, state, body), np.float64)
-  return np.concatenate([centre, 0.2 * normal], -1)
+  return np.concatenate([centre, centre + 0.2 * normal], -1)
 
 
 @pytest.mark.parametrize(

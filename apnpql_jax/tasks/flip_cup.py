@@ -185,12 +185,14 @@ class FlipCup(TableTask):
     return self._placed(state) & at_rest & (away > CLEAR)
 
   def objects(self, state: PhysicsState) -> Array:
-    """f32[worlds, 11]: cup's centre, a pointer towards its mouth, the goal, m, and
-    the cup's half width and half height, m."""
+    """f32[worlds, 12]: cup's centre, a point towards its mouth, the goal, and a point
+    half the cup's width beside its centre and half its height above, m."""
     cup = self._cup_pos(state)
-    sizes = jnp.stack([self._half_width(state), self._half_height(state)], -1)
+    to_mouth = cup + geometry.POINTER * self._axis(state)
+    width, height = self._half_width(state), self._half_height(state)
+    corner = cup + jnp.stack([width, 0 * width, height], -1)
     goal = state.mocap_pos[:, self._goal]
-    return jnp.concatenate([cup, geometry.POINTER * self._axis(state), goal, sizes], -1)
+    return jnp.concatenate([cup, to_mouth, goal, corner], -1)
 
   def expert(
     self, state: PhysicsState, kinematics: Kinematics, primitives: Array

@@ -17,7 +17,7 @@ REST_TURN = 0.5
 """rad/s."""
 
 POINTER = 0.2
-"""m; a direction is observed as a vector of this length, so that a turn by a few
+"""m; a direction is observed as a point this far away, so that a turn by a few
 degrees weighs as much as a few centimetres."""
 
 

@@ -153,13 +153,13 @@ class PlacePlate(TableTask):
     return self._in_box(state) & at_rest & (distance > RADIUS - GRASP_INSET + CLEAR)
 
   def objects(self, state: PhysicsState) -> Array:
-    """f32[worlds, 12]: centre of the plate and a pointer along its axis, the same for
-    the box and its longer side, m."""
+    """f32[worlds, 12]: centre of the plate and a point on its axis, the same for the
+    box and its longer side, m."""
     plate, goal = self._plate_pos(state), state.mocap_pos[:, self._goal]
     box_yaw = geometry.yaw(state.mocap_quat[:, self._goal])
     along = jnp.stack([jnp.cos(box_yaw), jnp.sin(box_yaw), 0 * box_yaw], -1)
-    pointers = geometry.POINTER * self._axis(state), geometry.POINTER * along
-    return jnp.concatenate([plate, pointers[0], goal, pointers[1]], -1)
+    on_axis = plate + geometry.POINTER * self._axis(state)
+    return jnp.concatenate([plate, on_axis, goal, goal + geometry.POINTER * along], -1)
 
   def expert(
     self, state: PhysicsState, kinematics: Kinematics, primitives: Array

@@ -129,13 +129,14 @@ class StackBox(TableTask):
     return stacked & on_table & at_rest & (geometry.norm(tool - yellow) > CLEAR)
 
   def objects(self, state: PhysicsState) -> Array:
-    """f32[worlds, 12]: for yellow and blue, xyz of the centre and a pointer along the
-    face nearest to the world's x axis, m: boxes look the same after a quarter turn."""
+    """f32[worlds, 12]: of either box the centre and a point beyond the face nearest
+    to the world's x axis, m: boxes look the same after a quarter turn."""
     parts = []
     for address in (self._yellow, self._blue):
       angle = self._yaw(state, address)
       heading = jnp.stack([jnp.cos(angle), jnp.sin(angle), 0 * angle], -1)
-      parts += [state.qpos[:, address : address + 3], geometry.POINTER * heading]
+      centre = state.qpos[:, address : address + 3]
+      parts += [centre, centre + geometry.POINTER * heading]
     return jnp.concatenate(parts, -1)
 
   def expert(

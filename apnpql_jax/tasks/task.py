@@ -56,7 +56,8 @@ class Task(Protocol):
     ...
 
   def objects(self, state: PhysicsState) -> Array:
-    """f32[worlds, n]: privileged poses of objects and goals for --obs state."""
+    """f32[worlds, 3 k]: k points (m) that tell the poses of objects and goals, for
+    --obs state. A direction is the point ``geometry.POINTER`` away in it."""
     ...
 
   def expert(
