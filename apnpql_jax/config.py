@@ -35,7 +35,7 @@ class EnvConfig:
   """Task to solve; `apnpql list` names them."""
 
   obs: str = "pixels"
-  """What the agent sees: pixels (two cameras) or state (privileged object poses)."""
+  """What the agent sees: pixels (two cameras) or state (points of the objects)."""
 
   backend: str = "auto"
   """Physics engine: mjx, native (C MuJoCo), or auto (native on CPU, mjx elsewhere)."""

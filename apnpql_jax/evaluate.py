@@ -115,7 +115,7 @@ def evaluate_run(
     seed: of rows and actions.
     backend: physics engine; the run's own if None.
     step: of the checkpoint; the newest if None.
-    greedy: the candidate of highest value acts, not one drawn by its weight.
+    greedy: the candidate of highest value or, of a parametric policy, the mean acts.
 
   Raises:
     ConfigError: not a run folder, or no readable checkpoint.

@@ -89,7 +89,8 @@ class Evaluate:
   """Seed of the episodes and of the policy."""
 
   greedy: _Flag = False
-  """Take the candidate of highest value instead of drawing one as in training."""
+  """Instead of drawing an action as in training take the candidate of highest value,
+  or, of a parametric policy, the mean."""
 
   backend: Annotated[
     str | None, tyro.conf.arg(help_behavior_hint="(default: as in training)")

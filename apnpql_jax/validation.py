@@ -107,7 +107,7 @@ def check_name(field: str, value: str, valid: Sequence[str]) -> None:
 
 
 def replay_bytes(config: TrainConfig) -> int:
-  """Bytes the agent and expert replays take at most (object poses not counted)."""
+  """Bytes the agent and expert replays take at most (points of objects not counted)."""
   images = math.prod(config.env.global_size) + math.prod(config.env.wrist_size)
   slot = _OTHER_BYTES + (3 * images if config.env.obs == "pixels" else 0)
   return slot * (config.replay.capacity + config.replay.expert_steps)

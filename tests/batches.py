@@ -30,8 +30,8 @@ def random_batch(
   windows: int = 0,
   instants: int = 0,
 ) -> Transition:
-  """Transitions with noise for everything; with a window of N instants if asked, and
-  with observations of L instants each."""
+  """Transitions with noise for everything; if asked with images, with a window of N
+  instants, and with observations of L instants each."""
   rng = np.random.default_rng(seed)
 
   def normal(*shape: int) -> jax.Array:
@@ -47,9 +47,10 @@ def random_batch(
     shape += (instants,) * bool(instants)
     return Observation(
       robot=normal(*shape, 21),
+      tool=normal(*shape, 3),
       global_image=image(*shape, 72, 96, 3),
       wrist_image=image(*shape, 36, 64, 3),
-      objects=None if pixels else normal(*shape, 8),
+      objects=normal(*shape, 9),
     )
 
   def action(*shape: int) -> jax.Array:

@@ -15,7 +15,7 @@ import rlax
 from apnpql_jax.agents import objectives
 from apnpql_jax.agents.algorithms import algorithm_of
 from apnpql_jax.agents.learner import bellman_target, make_agent
-from apnpql_jax.config import AgentConfig
+from apnpql_jax.config import AgentConfig, ConfigError
 
 N = 4
 BATCH = 5
@@ -61,6 +61,11 @@ def agent_with(algorithm: str, evaluation: str):
   params["z"] = jax.tree.map(lambda x: 3.0 * x, params["z"])
   params["z"]["out"]["kernel"] = random_array(9, 8, 1)
   return agent, algorithm_of(config), params
+
+
+def test_retrace_is_refused_where_the_policy_has_no_density():
+  with pytest.raises(ConfigError, match="ap_cem"):
+    agent_with("ap_cem", "retrace")
 
 
 @pytest.mark.parametrize("algorithm", ["svg_prior", "ap_npql"])

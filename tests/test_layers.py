@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from pathlib import Path
+import re
 
 import pytest
 
@@ -135,3 +136,10 @@ def test_only_the_entry_point_knows_the_command_line():
   graph = modules()
   knowing = {m for m, known in graph.items() if f"{NAME}.cli" in known}
   assert knowing == {f"{NAME}.__main__"}
+
+
+def test_tests_that_documents_name_exist():
+  files = {path.stem: path.read_text() for path in Path(__file__).parent.glob("*.py")}
+  known = files.keys() | set(re.findall(r"def (test_\w+)\(", "".join(files.values())))
+  for document in PACKAGE.parent.glob("docs/*.md"):
+    assert set(re.findall(r"`(test_\w+)", document.read_text())) <= known, document

@@ -38,6 +38,7 @@ def observation(batch: int, *, pixels: bool, objects: bool = False) -> Observati
 
   return Observation(
     robot=jnp.asarray(rng.normal(size=(batch, 21)), jnp.float32),
+    tool=jnp.asarray(rng.normal(size=(batch, 3)), jnp.float32),
     global_image=image(72, 96) if pixels else None,
     wrist_image=image(36, 64) if pixels else None,
     objects=jnp.asarray(rng.normal(size=(batch, 9)), jnp.float32) if objects else None,
@@ -194,6 +195,21 @@ def test_points_are_seen_from_the_tool_in_detail_where_they_are_near():
   np.testing.assert_allclose(seen, expected, atol=1e-5)
 
 
+def test_features_tell_a_centimetre_near_the_tool():
+  networks = all_networks()
+  seen = observation(1, pixels=False, objects=True)
+  params = jax.jit(networks.init)(jax.random.key(0), seen)
+
+  def phi(offset: jax.Array) -> jax.Array:
+    """Three points on one side of the tool."""
+    assert seen.tool is not None
+    points = jnp.tile(seen.tool + offset, (1, 3))
+    return networks.at(params, seen.replace(objects=points)).phi
+
+  near, far = (jnp.linalg.norm(phi(x + 0.01) - phi(x)) for x in (0.0, 0.4))
+  assert near > 2.0 * far > 0.0
+
+
 @pytest.mark.parametrize(
   "pixels, objects", [(True, False), (False, True), (True, True)]
 )
@@ -217,12 +233,14 @@ def test_outputs_have_the_declared_shapes(pixels: bool, objects: bool):
     assert mixture.logits.shape == mixture.gripper_logits.shape == (4, num)
 
 
-@pytest.mark.parametrize("changed", ["robot", "global_image", "wrist_image"])
+@pytest.mark.parametrize(
+  "changed", ["robot", "tool", "global_image", "wrist_image", "objects"]
+)
 @pytest.mark.parametrize("kind", IMAGE_FEATURES)
 def test_features_depend_on_every_modality(changed: str, kind: str):
   config = dataclasses.replace(CONFIG, global_features=kind, wrist_features=kind)
   networks = all_networks(config)
-  seen = observation(2, pixels=True)
+  seen = observation(2, pixels=True, objects=True)
   params = jax.jit(networks.init)(jax.random.key(0), seen)
   other = seen.replace(**{changed: getattr(seen, changed) // 2})
   assert np.any(networks.at(params, seen).phi != networks.at(params, other).phi)

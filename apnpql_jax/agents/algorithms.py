@@ -28,7 +28,7 @@ from apnpql_jax.agents.regularisers import (
   previous_policy,
   uniform,
 )
-from apnpql_jax.config import AgentConfig, check_name
+from apnpql_jax.config import AgentConfig, ConfigError, check_name
 from apnpql_jax.dists.action import ActionDistribution
 
 
@@ -40,7 +40,8 @@ class Algorithm:
   """b: (heads, target network's heads) -> distribution the policy is kept close to."""
 
   policy: Callable[..., Candidates]
-  """What acts and is evaluated: (heads, b, key, num_samples) -> weighted candidates."""
+  """What acts and is evaluated: (heads, b, key, num_samples, greedy) -> weighted
+  candidates."""
 
   regulariser_update: Callable[..., Losses]
   """(heads, b, candidates, batch, key, nu) -> losses of b and nu; the candidates are
@@ -105,7 +106,8 @@ def algorithm_of(config: AgentConfig) -> Algorithm:
   """The row that ``config`` names, with the columns that it replaces.
 
   Raises:
-    ConfigError: no such row; the message lists the valid names.
+    ConfigError: no such row; the message lists the valid names. Or Retrace for a
+      policy without a density.
   """
   check_name("agent.algorithm", config.algorithm, tuple(ALGORITHMS))
   row = ALGORITHMS[config.algorithm]
@@ -114,6 +116,11 @@ def algorithm_of(config: AgentConfig) -> Algorithm:
   if config.policy_evaluation != "row":
     evaluation = EVALUATIONS[config.policy_evaluation]
     row = dataclasses.replace(row, policy_evaluation=evaluation)
+  if row.policy is cem and row.policy_evaluation is Retrace:
+    raise ConfigError(
+      "agent.policy_evaluation retrace needs the density of the policy, and that of "
+      "the best of many draws is not known; choose another for ap_cem"
+    )
   return row
 
 

@@ -22,7 +22,6 @@ _STEP_SCALE = 7.0
 _POSITION_SCALE = 5.0
 """Brings positions within reach of the arm (m) to order one, centimetres to 0.05."""
 
-
 _NEAR = 0.05, 0.2
 """m; distances from the tool within which points are seen in detail."""
 
@@ -85,9 +84,9 @@ class Encoder(nn.Module):
 
   Keypoints of a camera are positions and go with those of the robot. A map has its own
   projection, and the projections are summed, so that thousands of pixel features do not
-  drown a few dozen of the robot. The layer
-  norm gives phi a fixed scale: the heads that read phi without training it (prior,
-  alpha) then follow the encoder instead of chasing its growing activations.
+  drown a few dozen of the robot. The layer norm gives phi a fixed scale: the heads that
+  read phi without training it (prior, alpha) then follow the encoder instead of chasing
+  its growing activations.
 
   An LSTM, if there is one, reads what would be phi of the last instants of an episode.
   It begins with an empty memory in acting and learning alike. Its last output is phi,

@@ -43,10 +43,10 @@ class Agent:
   act: Callable[[Params, Observation, Array, bool], tuple[Array, Metrics]]
   """(params, observation [B], key, greedy) -> actions f32[B, 7], info f32[B] each.
 
-  The policy's candidates are drawn, and one is picked by its weights, or, if greedy
-  (a Python bool), the one of highest value. Info has the action's log_prob, which
-  Retrace needs, and for a look at a policy its q, q_max and ess of the candidates,
-  and alpha."""
+  The policy's candidates are drawn, and one is picked by its weights. If greedy (a
+  Python bool) it is the one of highest value, or the mean of a parametric policy. Info
+  has the action's log_prob, which Retrace needs, and for a look at a policy its q,
+  q_max and ess of the candidates, and alpha."""
 
   update: Callable[[LearnerState, Transition, Array], tuple[LearnerState, Metrics]]
   """(state, transitions [B], key) -> state after one update, metrics f32[]."""
@@ -154,13 +154,10 @@ def _act(
   key_candidates, key_pick = jax.random.split(key)
   heads = networks.at(params, observation)
   candidates = _candidates(
-    algorithm, heads, key_candidates, heads.config.policy_samples
+    algorithm, heads, key_candidates, heads.config.policy_samples, greedy=greedy
   )
   q_values, weights = candidates.q_values, candidates.weights
-  if greedy:
-    chosen = jnp.argmax(q_values, axis=0)
-  else:
-    chosen = boltzmann.pick(key_pick, weights)
+  chosen = boltzmann.pick(key_pick, weights)
   actions = jnp.take_along_axis(candidates.actions, chosen[None, :, None], axis=0)
   q = jnp.take_along_axis(q_values, chosen[None], axis=0)
   info = {
@@ -190,11 +187,16 @@ def bellman_target(
 
 
 def _candidates(
-  algorithm: Algorithm, heads: Heads, key: Array, num_samples: int
+  algorithm: Algorithm,
+  heads: Heads,
+  key: Array,
+  num_samples: int,
+  *,
+  greedy: bool = False,
 ) -> Candidates:
   """The policy of these heads, which are their own past if the regulariser asks."""
   prior = algorithm.regulariser(heads, heads)
-  return algorithm.policy(heads, prior, key, num_samples=num_samples)
+  return algorithm.policy(heads, prior, key, num_samples=num_samples, greedy=greedy)
 
 
 def _ap_errors(predicted: Array, label: Array) -> Metrics:

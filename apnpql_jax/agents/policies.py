@@ -62,7 +62,12 @@ def clip_action(actions: Array) -> Array:
 
 
 def non_parametric(
-  heads: Heads, prior: ActionDistribution, key: Array, *, num_samples: int
+  heads: Heads,
+  prior: ActionDistribution,
+  key: Array,
+  *,
+  num_samples: int,
+  greedy: bool = False,
 ) -> Candidates:
   """q = b exp(Q / alpha) / Z by self-normalised importance sampling (paper Eq. 6).
 
@@ -71,6 +76,7 @@ def non_parametric(
     prior: the regulariser b at the same states.
     key: random key.
     num_samples: candidates S per state.
+    greedy: all weight on the one of highest value.
 
   Returns:
     Candidates drawn from ``prior`` with weights softmax(Q / alpha); no gradients.
@@ -80,11 +86,18 @@ def non_parametric(
   actions, outputs, q_values = _evaluate(heads, samples)
   alpha = heads.alpha()
   weights = boltzmann.importance_weights(q_values, alpha)
+  if greedy:
+    weights = _all_on_the_highest(q_values)
   return Candidates(samples, actions, outputs, q_values, weights, prior, 1.0 / alpha)
 
 
 def parametric(
-  heads: Heads, prior: ActionDistribution, key: Array, *, num_samples: int
+  heads: Heads,
+  prior: ActionDistribution,
+  key: Array,
+  *,
+  num_samples: int,
+  greedy: bool = False,
 ) -> Candidates:
   """pi_psi: half as many draws of the arm, each with the gripper open and closed.
 
@@ -96,23 +109,31 @@ def parametric(
     prior: not needed.
     key: random key.
     num_samples: candidates S per state, rounded down to an even number.
+    greedy: the mean in place of draws, all weight on the likelier gripper.
   """
   del prior
   policy = heads.policy()
-  drawn = policy.sample(key, num_samples // 2)
+  drawn = policy.sample(key, 1 if greedy else num_samples // 2)
+  if greedy:
+    drawn = drawn.at[..., :ARM_DOF].set(policy.mean[None, ..., 0, :])
   both = jnp.stack([drawn.at[..., -1].set(gripper) for gripper in (0.0, 1.0)])
   samples = both.reshape(-1, *drawn.shape[1:])
   actions, outputs, q_values = _evaluate(heads.frozen(), samples)
   log_prob = policy.log_prob(samples).reshape(both.shape[:-1])
-  weights = jax.nn.softmax(log_prob, axis=0).reshape(q_values.shape)
+  weights = jax.nn.softmax(log_prob, axis=0).reshape(q_values.shape) / drawn.shape[0]
+  if greedy:
+    weights = _all_on_the_highest(weights)
   tilt = jnp.zeros(q_values.shape[1:])
-  return Candidates(
-    samples, actions, outputs, q_values, weights / drawn.shape[0], policy, tilt
-  )
+  return Candidates(samples, actions, outputs, q_values, weights, policy, tilt)
 
 
 def cem(
-  heads: Heads, prior: ActionDistribution, key: Array, *, num_samples: int
+  heads: Heads,
+  prior: ActionDistribution,
+  key: Array,
+  *,
+  num_samples: int,
+  greedy: bool = False,
 ) -> Candidates:
   """The best action that the cross-entropy method finds (QT-Opt), from draws of b.
 
@@ -121,11 +142,12 @@ def cem(
     prior: the regulariser b: the first draw is its.
     key: random key.
     num_samples: not needed; ``CEM_SAMPLES`` belong to the method.
+    greedy: not needed; the method is.
 
   Returns:
     The last draw, all weight on its best action; no gradients.
   """
-  del num_samples
+  del num_samples, greedy
   heads, base = heads.frozen(), jax.lax.stop_gradient(prior)
   *keys, last = jax.random.split(key, CEM_ITERATIONS)
   for k in keys:
@@ -133,8 +155,7 @@ def cem(
     base = _refit(samples, _evaluate(heads, samples)[2], heads.config.policy_min_prob)
   samples = base.sample(last, CEM_SAMPLES)
   actions, outputs, q_values = _evaluate(heads, samples)
-  best = jnp.argmax(q_values, axis=0)
-  weights = jax.nn.one_hot(best, CEM_SAMPLES, axis=0, dtype=q_values.dtype)
+  weights = _all_on_the_highest(q_values)
   tilt = jnp.zeros(q_values.shape[1:])
   return Candidates(samples, actions, outputs, q_values, weights, base, tilt)
 
@@ -144,6 +165,11 @@ def _evaluate(heads: Heads, samples: Array) -> tuple[Array, Array, Array]:
   actions = clip_action(samples)
   outputs = heads.z(actions)
   return actions, outputs, heads.networks.evaluation.value(outputs)
+
+
+def _all_on_the_highest(x: Array) -> Array:
+  """Weights f32[S, *b] that pick the highest of f32[S, *b]."""
+  return jax.nn.one_hot(jnp.argmax(x, axis=0), x.shape[0], axis=0, dtype=x.dtype)
 
 
 def _refit(samples: Array, q_values: Array, min_prob: float) -> GripperGMM:
