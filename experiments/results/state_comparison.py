@@ -56,7 +56,7 @@ class Row(NamedTuple):
 NARROW = "--agent.policy-initial-std 0.05"
 SAC = "--agent.epsilon 10 --agent.min-alpha 0.001"
 
-# Limits and floors by a small search on one task: experiments/log.md, sac1 to sac4.
+# Limits and floors by a small search: experiments/log.md, sac1 to sac4.
 ROWS = {
   "ap_npql": Row("ap_npql"),
   "ap_mpo": Row("ap_mpo", NARROW),
