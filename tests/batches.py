@@ -47,10 +47,10 @@ def random_batch(
     shape += (instants,) * bool(instants)
     return Observation(
       robot=normal(*shape, 21),
-      tool=normal(*shape, 3),
+      tool=0.3 * normal(*shape, 3),
       global_image=image(*shape, 72, 96, 3),
       wrist_image=image(*shape, 36, 64, 3),
-      objects=normal(*shape, 9),
+      objects=0.3 * normal(*shape, 9),
     )
 
   def action(*shape: int) -> jax.Array:
