@@ -200,7 +200,7 @@ def test_features_tell_a_centimetre_near_the_tool():
   seen = observation(1, pixels=False, objects=True)
   params = jax.jit(networks.init)(jax.random.key(0), seen)
 
-  def phi(offset: jax.Array) -> jax.Array:
+  def phi(offset: float) -> jax.Array:
     """Three points on one side of the tool."""
     assert seen.tool is not None
     points = jnp.tile(seen.tool + offset, (1, 3))
