@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import dataclasses
+import os
 from pathlib import Path
 import sys
 from typing import TYPE_CHECKING, Any
@@ -71,6 +72,7 @@ def evaluate(args: Evaluate, argv: Sequence[str]) -> Json:
   if not args.run:
     raise ConfigError("evaluate needs a run folder: apnpql evaluate RUN")
   _check_episodes(args.episodes, args.seed)
+  _check_video(args.video)
   if args.backend is not None:
     check_name("backend", args.backend, BACKENDS)
   runs.load_run_config(Path(args.run), _tell)
@@ -84,6 +86,7 @@ def evaluate(args: Evaluate, argv: Sequence[str]) -> Json:
     backend=args.backend,
     step=_checkpoint_step(args),
     greedy=args.greedy,
+    video=args.video,
   )
 
 
@@ -91,6 +94,7 @@ def collect(args: Collect, argv: Sequence[str]) -> Json:
   """Plays episodes with the scripted expert of a task."""
   del argv
   _check_episodes(args.episodes, args.seed)
+  _check_video(args.video)
   check_name("backend", args.backend, BACKENDS)
   if not 0.0 <= args.noise < float("inf"):
     raise ConfigError(f"--noise {args.noise} must be a number of at least 0, in rad/s")
@@ -107,7 +111,7 @@ def collect(args: Collect, argv: Sequence[str]) -> Json:
   # The expert acts on privileged poses: drawing images would only cost time.
   env = dataclasses.replace(env, task=args.task, backend=args.backend, obs="state")
   settings = {"episodes": args.episodes, "seed": args.seed, "noise": args.noise}
-  figures = evaluate_expert(env, **settings)
+  figures = evaluate_expert(env, video=args.video, **settings)
   if args.save is None:
     return figures
   from apnpql_jax import demonstrations
@@ -224,6 +228,20 @@ def _check_episodes(episodes: int, seed: int) -> None:
     raise ConfigError(f"--episodes {episodes} must be at least 1")
   if not 0 <= seed < 2**31:
     raise ConfigError(f"--seed {seed} must be within 0 and 2**31 - 1")
+
+
+def _check_video(path: Path | None) -> None:
+  if path is None:
+    return
+  if path.suffix not in (".mp4", ".gif"):
+    raise ConfigError(f"--video {path} must end in .mp4 or .gif")
+  try:
+    folder = next(p for p in path.absolute().parents if p.exists())
+    fit = folder.is_dir() and os.access(folder, os.W_OK) and not path.is_dir()
+  except OSError as error:
+    raise ConfigError(f"--video {path}: {error}") from None
+  if not fit:
+    raise ConfigError(f"--video {path} cannot be written")
 
 
 def _with_shortcuts(args: Train) -> TrainConfig:

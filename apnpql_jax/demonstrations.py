@@ -17,7 +17,8 @@ import numpy as np
 
 from apnpql_jax import memory, npz, replay
 from apnpql_jax.config import ConfigError, EnvConfig, TrainConfig
-from apnpql_jax.env import Env, EnvState, make_env
+from apnpql_jax.env import Env, make_env
+from apnpql_jax.env_state import EnvState
 from apnpql_jax.iteration import example_slot, place
 from apnpql_jax.primitives import ik
 from apnpql_jax.replay import Replay
@@ -169,10 +170,13 @@ def make_replay(demos: Demonstrations, config: TrainConfig, env: Env) -> Replay:
   targets[fresh] = _solve_targets(demos, index[fresh], env)
 
   @jax.jit
-  def remake(index: Array, fresh: Array, targets: Array, ends: Array) -> Replay:
+  def remake(
+    start: EnvState, index: Array, fresh: Array, targets: Array, ends: Array
+  ) -> Replay:
     def instant(before: EnvState, seen: tuple) -> tuple[EnvState, Slot]:
       rows, fresh, targets, ends = seen
-      state = env.visit(before, _states(demos, env.task.scene, rows), targets, fresh)
+      now = _states(demos, env.task.scene, rows)
+      state = env.arrive(env.after(before, now, targets, fresh))
       timestep = state.timestep
       timestep = timestep.replace(
         truncated=timestep.truncated | ends & ~timestep.terminated
@@ -180,12 +184,12 @@ def make_replay(demos: Demonstrations, config: TrainConfig, env: Env) -> Replay:
       action = jnp.asarray(demos.action, jnp.float32)[rows]
       return state, Slot(timestep, action, jnp.full(worlds, CERTAIN, jnp.float32))
 
-    start = env.reset(jnp.zeros(worlds, jnp.int32))
     _, chunk = jax.lax.scan(instant, start, (index, fresh, targets, ends))
     ring = replay.add(replay.create(example_slot(start), length, worlds), chunk)
     return place(ring, env.mesh)
 
-  return remake(*map(jnp.asarray, (index, fresh, targets, ends)))
+  start = env.reset(jnp.zeros(worlds, jnp.int32))
+  return remake(start, *map(jnp.asarray, (index, fresh, targets, ends)))
 
 
 def save_expert(path: Path, config: EnvConfig, **settings: Any) -> dict[str, Any]:
@@ -208,7 +212,7 @@ def record_expert(
   rows = jax.random.randint(row_key, (episodes,), 0, env.bank_split)
 
   @jax.jit
-  def play(rows: Array, key: Array):
+  def play(start: EnvState, key: Array):
     def period(state: EnvState, key: Array):
       policy_key, env_key = jax.random.split(key)
       action, _ = policy(state, policy_key)
@@ -216,9 +220,10 @@ def record_expert(
       return after, (state.physics, action, state.timestep.last, state.faults)
 
     keys = jax.random.split(key, env.config.episode_steps + 1)
-    return jax.lax.scan(period, env.reset(rows), keys)[1]
+    return jax.lax.scan(period, start, keys)[1]
 
-  state, action, last, faults = jax.tree.map(np.asarray, play(rows, key))
+  played = play(env.reset(rows), key)
+  state, action, last, faults = jax.tree.map(np.asarray, played)
   end = last.argmax(0)  # The first last instant; all sound episodes end in time.
   sound = last.any(0) & (faults[end, np.arange(episodes)] == 0)
   inside = (np.arange(len(last))[:, None] <= np.where(sound, end, -1)).T

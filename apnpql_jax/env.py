@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import functools
 
-from flax import struct
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
@@ -18,6 +17,7 @@ from jax.sharding import Mesh
 from apnpql_jax import sharding
 from apnpql_jax.cameras import Renderer, make_cameras
 from apnpql_jax.config import ConfigError, EnvConfig
+from apnpql_jax.env_state import Arrival, EnvState
 from apnpql_jax.primitives import tracking
 from apnpql_jax.primitives.bank import ResetBank, load_bank
 from apnpql_jax.randomization.worlds import make_randomize
@@ -35,25 +35,12 @@ HELD_OUT_SHARE = 0.25
 """Share of the bank's rows that only evaluation sees."""
 
 
-class EnvState(struct.PyTreeNode):
-  """Everything the worlds need to go on."""
-
-  physics: PhysicsState  # [worlds, ...]
-  targets: Array  # f32[worlds, 3, 6]: joint targets of the primitives, rad
-  elapsed: Array  # i32[worlds]: control periods since the reset
-  timestep: TimeStep  # [worlds, ...]: the present instant
-  faults: Array  # i32[worlds]: times a world was reset for not being finite
-  recent: Observation | None = None  # [worlds, L, ...]: for agents with an LSTM
-
-  @property
-  def seen(self) -> Observation:
-    """What the agent acts on: the present observation, or the last L of the episode,
-    oldest first, its first one repeated where it is shorter."""
-    return self.timestep.observation if self.recent is None else self.recent
-
-
 class Env:
-  """The worlds of one task; holds constants only."""
+  """The worlds of one task; holds constants only.
+
+  A step is ``arrive(advance(state, ...))`` and a reset ``arrive(begin(rows))``. What
+  they share is most of a program, and a loop that begins with it has it once.
+  """
 
   def __init__(
     self,
@@ -83,8 +70,9 @@ class Env:
     self._chain = arm.make_chain(scene)
     self._kinematics = make_kinematics(scene)
     self._cameras = make_cameras(config, scene)
-    # Resets, steps and visits share one trace for each number of worlds.
+    # Both keep one trace for each number of worlds; outside jit they are compiled.
     self._arrive = sharding.per_device(jax.jit(self._judge_and_observe), mesh)
+    self._reset = jax.jit(lambda rows: self.arrive(self.begin(rows)))
     self._randomize = None
     if config.randomize:
       self._randomize = make_randomize(config.randomization, scene)
@@ -111,20 +99,7 @@ class Env:
     Args:
       rows: i32[worlds].
     """
-    count = rows.shape[0]
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), rows)
-    state = self._arrive(
-      self._initial(rows, keys),
-      self._bank.targets[rows],
-      elapsed=jnp.zeros(count, jnp.int32),
-      fresh=jnp.ones(count, bool),
-      history=jnp.zeros((count, HISTORY * 7)),
-      faults=jnp.zeros(count, jnp.int32),
-    )
-    if not self._instants:
-      return state
-    repeated = functools.partial(_repeated, count=self._instants)
-    return state.replace(recent=jax.tree.map(repeated, state.timestep.observation))
+    return self._reset(rows)
 
   def step(self, state: EnvState, action: Array, key: Array) -> EnvState:
     """One control period in every world.
@@ -134,20 +109,44 @@ class Env:
       action: f32[worlds, 7], see ``types.ACTION_DIM``.
       key: draws the rows of worlds that start again.
     """
-    advance = sharding.per_device(self.physics.step, self.mesh)
-    moved = advance(state.physics, action[:, :6], action[:, 6])
+    return self.arrive(self.advance(state, action, key))
+
+  def begin(self, rows: Array) -> Arrival:
+    """The first instants of one world per bank row; see ``reset``."""
+    count = rows.shape[0]
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), rows)
+    first = Arrival(
+      physics=self._initial(rows, keys),
+      targets=self._bank.targets[rows],
+      elapsed=jnp.zeros(count, jnp.int32),
+      fresh=jnp.ones(count, bool),
+      history=jnp.zeros((count, HISTORY * 7)),
+      faults=jnp.zeros(count, jnp.int32),
+      recent=None,
+    )
+    if not self._instants:
+      return first
+    # Only shapes matter: where an episode begins, ``arrive`` repeats what is seen.
+    seen = jax.eval_shape(self._arrive, first).timestep.observation
+    empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), seen)
+    return first.replace(recent=jax.tree.map(self._repeated, empty))
+
+  def advance(self, state: EnvState, action: Array, key: Array) -> Arrival:
+    """Where a control period leads every world; see ``step``."""
+    physics_step = sharding.per_device(self.physics.step, self.mesh)
+    moved = physics_step(state.physics, action[:, :6], action[:, 6])
     broken = ~state.timestep.last & ~self._sound(state, action, moved)
     reset = state.timestep.last | broken
     rows = jax.random.randint(key, reset.shape, 0, self.bank_split)
     keys = jax.random.split(jax.random.fold_in(key, 1), len(rows))
     initial = self._initial(rows, keys)
     merged = jax.tree.map(functools.partial(_where, reset), initial, moved)
-    arrived = self.visit(state, merged, self._bank.targets[rows], reset)
-    return arrived.replace(faults=state.faults + broken)
+    arrival = self.after(state, merged, self._bank.targets[rows], reset)
+    return arrival.replace(faults=state.faults + broken)
 
-  def visit(
+  def after(
     self, before: EnvState, now: PhysicsState, targets: Array, fresh: Array
-  ) -> EnvState:
+  ) -> Arrival:
     """The instant that follows on ``before`` when the worlds are as ``now``.
 
     Args:
@@ -156,22 +155,27 @@ class Env:
       targets: f32[worlds, 3, 6], joint targets of episodes that begin, rad.
       fresh: bool[worlds], where they do.
     """
-    state = self._arrive(
-      now,
-      _where(fresh, targets, before.targets),
+    return Arrival(
+      physics=now,
+      targets=_where(fresh, targets, before.targets),
       elapsed=jnp.where(fresh, 0, before.elapsed + 1),
       fresh=fresh,
       history=before.timestep.observation.robot,
       faults=before.faults,
+      recent=before.recent,
     )
-    if before.recent is None:
+
+  def arrive(self, arrival: Arrival) -> EnvState:
+    """Judges, labels and observes the instant the worlds have come to."""
+    state = self._arrive(arrival.replace(recent=None))
+    if arrival.recent is None:
       return state
 
-    def follow(recent: Array, new: Array) -> Array:
-      recent = _where(fresh, _repeated(new, recent.shape[1]), recent)
+    def push(recent: Array, new: Array) -> Array:
+      recent = _where(arrival.fresh, self._repeated(new), recent)
       return jnp.concatenate([recent[:, 1:], new[:, None]], axis=1)
 
-    recent = jax.tree.map(follow, before.recent, state.timestep.observation)
+    recent = jax.tree.map(push, arrival.recent, state.timestep.observation)
     return state.replace(recent=recent)
 
   def tool_targets(self, state: PhysicsState) -> tuple[Array, Array, Array]:
@@ -200,6 +204,10 @@ class Env:
     """
     return state if self._randomize is None else self._randomize(state, keys)
 
+  def _repeated(self, x: Array) -> Array:
+    """[worlds, ...] -> [worlds, L, ...]."""
+    return jnp.repeat(x[:, None], self._instants, axis=1)
+
   def _initial(self, rows: Array, keys: Array) -> PhysicsState:
     bank = self._bank
     state = physics.initial_state(
@@ -221,27 +229,19 @@ class Env:
     finite = [jnp.isfinite(x).all(tuple(range(1, x.ndim))) for x in seen]
     return jnp.stack(finite).all(0) & (moved.time > before.physics.time)
 
-  def _judge_and_observe(
-    self,
-    state: PhysicsState,
-    targets: Array,
-    *,
-    elapsed: Array,
-    fresh: Array,
-    history: Array,
-    faults: Array,
-  ) -> EnvState:
-    """Judges, labels and observes the instant the worlds have come to."""
+  def _judge_and_observe(self, arrival: Arrival) -> EnvState:
+    """All of ``arrive`` but the last L observations."""
+    state, fresh = arrival.physics, arrival.fresh
     kinematics = self._kinematics(state)
     *pose, close = self.task.tool_targets(state, kinematics)
     q = state.qpos[:, self.task.scene.arm_qpos]
-    present = jnp.broadcast_to(q[:, None], targets.shape)
+    present = jnp.broadcast_to(q[:, None], arrival.targets.shape)
     chain = arm.with_base(self._chain, self.task.scene, state.fields)
-    targets = tracking.refine(chain, targets, present, *pose)
+    targets = tracking.refine(chain, arrival.targets, present, *pose)
     solved = self.task.success(state, kinematics) & ~fresh
-    late = (elapsed >= self.config.episode_steps) & ~fresh
+    late = (arrival.elapsed >= self.config.episode_steps) & ~fresh
     timestep = TimeStep(
-      observation=self._observe(state, kinematics, fresh, history),
+      observation=self._observe(state, kinematics, fresh, arrival.history),
       reward=solved.astype(jnp.float32),
       terminated=solved,
       truncated=late & ~solved,
@@ -249,7 +249,7 @@ class Env:
         [tracking.follow(targets, q[:, None]), close[..., None]], axis=-1
       ),
     )
-    return EnvState(state, targets, elapsed, timestep, faults)
+    return EnvState(state, targets, arrival.elapsed, timestep, arrival.faults)
 
   def _observe(self, state, kinematics, fresh, history) -> Observation:
     scene = self.task.scene
@@ -296,11 +296,6 @@ def _substeps(config: EnvConfig, scene: Scene) -> int:
       f"scene's timestep, {timestep} s"
     )
   return substeps
-
-
-def _repeated(x: Array, count: int) -> Array:
-  """[worlds, ...] -> [worlds, count, ...]."""
-  return jnp.repeat(x[:, None], count, axis=1)
 
 
 def _where(condition: Array, yes: Array, no: Array) -> Array:

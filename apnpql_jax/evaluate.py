@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import dataclasses
 import math
 from pathlib import Path
@@ -10,67 +9,37 @@ import sys
 import time
 from typing import Any
 
-from flax import struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from apnpql_jax import checkpoint, leaves, memory, run_folder
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import EnvConfig
+from apnpql_jax.config import ConfigError, EnvConfig
 from apnpql_jax.env import Env, make_env
 from apnpql_jax.metrics import wilson_interval
-from apnpql_jax.rollout import Policy, agent_policy, expert_policy
-from apnpql_jax.types import Array
+from apnpql_jax.recording import record_episodes
+from apnpql_jax.rollout import (
+  Episodes,
+  Player,
+  agent_policy,
+  expert_policy,
+  make_player,
+)
 
 MAX_WORLDS = 64
 """Episodes played at once; more are played in turn."""
 
 
-class Episodes(struct.PyTreeNode):
-  """Outcome of one episode per world."""
-
-  success: Array  # bool[worlds]
-  length: Array  # i32[worlds]: control periods until success or time-out
-
-
-Player = Callable[[Any, Array, Array], Episodes]
-"""(parameters of the policy, bank rows i32[worlds], key) -> outcomes."""
-
-
-def make_player(env: Env, make_policy: Callable[[Any], Policy]) -> Player:
-  """A jitted function that plays one episode per row and stops when all are over."""
-
-  @jax.jit
-  def play(params: Any, rows: Array, key: Array) -> Episodes:
-    policy = make_policy(params)
-
-    def period(carry):
-      state, outcome, running, key = carry
-      key, policy_key, env_key = jax.random.split(key, 3)
-      state = env.step(state, policy(state, policy_key)[0], env_key)
-      running &= state.faults == 0  # What a world does after a fault is not counted.
-      solved = running & state.timestep.terminated
-      outcome = Episodes(outcome.success | solved, outcome.length + running)
-      return state, outcome, running & ~state.timestep.last, key
-
-    count = rows.shape[0]
-    nothing = Episodes(jnp.zeros(count, bool), jnp.zeros(count, jnp.int32))
-    start = (env.reset(rows), nothing, jnp.ones(count, bool), key)
-    return jax.lax.while_loop(lambda carry: carry[2].any(), period, start)[1]
-
-  return play
-
-
 def play_held_out(
   env: Env, play: Player, params: Any, *, episodes: int, seed: int
-) -> dict[str, Any]:
+) -> Episodes:
   """Plays ``episodes`` held-out episodes.
 
   The rows are a random order of all held-out ones, repeated if there are not enough.
 
   Returns:
-    episodes, successes, success_rate, ci95 (Wilson), mean_length (control periods).
+    the episodes; the first of them can be filmed.
   """
   key = jax.random.key(seed)
   rng = np.random.default_rng(seed)
@@ -88,13 +57,18 @@ def play_held_out(
     np.concatenate([np.asarray(getattr(p, f)) for p in played])[:episodes]
     for f in ("success", "length")
   )
-  successes = int(success.sum())
+  return played[0].replace(success=success, length=length)
+
+
+def figures_of(played: Episodes) -> dict[str, Any]:
+  """episodes, successes, success_rate, ci95 (Wilson), mean_length (control periods)."""
+  episodes, successes = len(played.success), int(played.success.sum())
   return {
     "episodes": episodes,
     "successes": successes,
     "success_rate": successes / episodes,
     "ci95": wilson_interval(successes, episodes),
-    "mean_length": float(length.mean()),
+    "mean_length": float(played.length.mean()),
   }
 
 
@@ -106,6 +80,7 @@ def evaluate_run(
   backend: str | None = None,
   step: int | None = None,
   greedy: bool = False,
+  video: Path | None = None,
 ) -> dict[str, Any]:
   """Plays held-out episodes with a checkpoint of a run.
 
@@ -116,9 +91,11 @@ def evaluate_run(
     backend: physics engine; the run's own if None.
     step: of the checkpoint; the newest if None.
     greedy: the candidate of highest value or, of a parametric policy, the mean acts.
+    video: where to write the first episodes as a video.
 
   Raises:
-    ConfigError: not a run folder, or no readable checkpoint.
+    ConfigError: not a run folder, no readable checkpoint, or the video cannot be
+      written.
   """
   began = time.monotonic()
   config = run_folder.open_run(run_dir).config
@@ -136,8 +113,8 @@ def evaluate_run(
     print(line, file=sys.stderr)
   learner = found.items["learner"]
   play = make_player(env, lambda params: agent_policy(agent, params, greedy=greedy))
-  figures = play_held_out(
-    env, play, learner.target_params, episodes=episodes, seed=seed
+  figures = _figures(
+    env, play, learner.target_params, episodes=episodes, seed=seed, video=video
   )
   return {
     "task": config.env.task,
@@ -151,13 +128,18 @@ def evaluate_run(
 
 
 def evaluate_expert(
-  env_config: EnvConfig, *, episodes: int, seed: int, noise: float
+  env_config: EnvConfig,
+  *,
+  episodes: int,
+  seed: int,
+  noise: float,
+  video: Path | None = None,
 ) -> dict[str, Any]:
-  """Plays held-out episodes with the task's scripted expert."""
+  """Plays held-out episodes with the task's scripted expert; see ``evaluate_run``."""
   began = time.monotonic()
   env = make_env(env_config)
   play = make_player(env, lambda _: expert_policy(env, noise=noise))
-  figures = play_held_out(env, play, None, episodes=episodes, seed=seed)
+  figures = _figures(env, play, None, episodes=episodes, seed=seed, video=video)
   return {
     "task": env_config.task,
     "algorithm": "expert",
@@ -166,3 +148,17 @@ def evaluate_expert(
     "checkpoint_step": None,
     "wall_s": time.monotonic() - began,
   }
+
+
+def _figures(
+  env: Env, play: Player, params: Any, *, episodes: int, seed: int, video: Path | None
+) -> dict[str, Any]:
+  """Those of held-out episodes, of which the first are filmed if there is a path."""
+  played = play_held_out(env, play, params, episodes=episodes, seed=seed)
+  figures = figures_of(played)
+  if video is None:
+    return figures
+  try:
+    return figures | {"video": str(record_episodes(env, played, video))}
+  except OSError as error:
+    raise ConfigError(f"cannot write {video}: {error}") from None

@@ -20,7 +20,8 @@ from jax.sharding import (
 from apnpql_jax import replay
 from apnpql_jax.agents.learner import Agent, LearnerState
 from apnpql_jax.config import TrainConfig
-from apnpql_jax.env import Env, EnvState
+from apnpql_jax.env import Env
+from apnpql_jax.env_state import EnvState
 from apnpql_jax.replay import Replay
 from apnpql_jax.rollout import agent_policy, expert_policy, rollout
 from apnpql_jax.sharding import AXIS
@@ -181,25 +182,25 @@ def initial_state(
   config: TrainConfig, env: Env, agent: Agent, expert: ExpertReplay
 ) -> TrainState:
   """The state before the first iteration; ``expert`` fills the expert's replay."""
+  keys = jax.random.split(jax.random.key(config.seed), 5)
+  key, row_key, init_key, expert_key, fault_key = keys
+  rows = jax.random.randint(row_key, (config.env.worlds,), 0, env.bank_split)
 
   @jax.jit
-  def start(key: Array) -> tuple[TrainState, Array]:
-    key, *keys = jax.random.split(key, 5)
-    rows = jax.random.randint(keys[0], (config.env.worlds,), 0, env.bank_split)
-    worlds = env.reset(rows)
+  def start(worlds: EnvState, key: Array, init_key: Array, fault_key: Array):
     length = config.replay.capacity // config.env.worlds
     state = TrainState(
-      learner=agent.init(keys[1], worlds.seen),
+      learner=agent.init(init_key, worlds.seen),
       env=worlds,
       replay=replay.create(example_slot(worlds), length, config.env.worlds),
       expert_replay=None,
       key=key,
       env_steps=jnp.zeros((), jnp.int32),
-      faults=Faults(in_a_row=jnp.zeros((), jnp.int32), key=keys[3]),
+      faults=Faults(in_a_row=jnp.zeros((), jnp.int32), key=fault_key),
     )
-    return place((state, keys[2]), env.mesh)
+    return place(state, env.mesh)
 
-  state, expert_key = start(jax.random.key(config.seed))
+  state = start(env.reset(rows), key, init_key, fault_key)
   state = state.replace(expert_replay=expert(config, env, expert_key))
   # Bound to its devices, as a restored state is, so that both make the same program.
   return jax.device_put(state, shardings(state, env.mesh))
@@ -243,14 +244,13 @@ def collect_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:
   if not length:
     return None
   policy = expert_policy(env, noise=config.replay.expert_noise)
+  row_key, play_key = jax.random.split(key)
+  rows = jax.random.randint(row_key, (worlds,), 0, env.bank_split)
 
   @jax.jit
-  def collect(key: Array) -> Replay:
-    row_key, play_key = jax.random.split(key)
-    rows = jax.random.randint(row_key, (worlds,), 0, env.bank_split)
-    state = env.reset(rows)
-    after, chunk = rollout(env, policy, state, play_key, length=length)
+  def collect(state: EnvState, key: Array) -> Replay:
+    after, chunk = rollout(env, policy, state, key, length=length)
     ring = replay.create(example_slot(state), length, worlds)
     return place(_remember(ring, state, after, chunk), env.mesh)
 
-  return collect(key)
+  return collect(env.reset(rows), play_key)

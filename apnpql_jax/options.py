@@ -97,6 +97,9 @@ class Evaluate:
   ] = None
   """Physics engine: auto, mjx or native."""
 
+  video: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="")] = None
+  """Also write a video of the first four episodes to this .mp4 or .gif."""
+
   json: _Flag = False
   """Print one JSON object on standard output and nothing else there."""
 
@@ -123,6 +126,9 @@ class Collect:
   save: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="")] = None
   """Also write that many episodes, from reset states of training, to this file of
   demonstrations."""
+
+  video: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="")] = None
+  """Also write a video of the first four episodes to this .mp4 or .gif."""
 
   json: _Flag = False
   """Print one JSON object on standard output and nothing else there."""

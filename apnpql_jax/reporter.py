@@ -11,12 +11,12 @@ from apnpql_jax import sharding
 from apnpql_jax.agents.learner import Agent
 from apnpql_jax.config import TrainConfig
 from apnpql_jax.env import Env
-from apnpql_jax.evaluate import make_player, play_held_out
+from apnpql_jax.evaluate import figures_of, play_held_out
 from apnpql_jax.iteration import TrainState
 from apnpql_jax.metrics import MetricWriter, plot_curve, read_evaluations
 from apnpql_jax.progress import TrainProgress
 from apnpql_jax.recording import record_episodes
-from apnpql_jax.rollout import agent_policy
+from apnpql_jax.rollout import agent_policy, make_player
 from apnpql_jax.run_folder import RunFolder
 
 EVAL_SEED = 1
@@ -56,8 +56,9 @@ class Reporter:
     """Builds the player of evaluations; nothing is compiled yet."""
     self._config, self._env, self.folder = config, env, folder
     self._writer, self._progress = writer, progress
-    self._policy = lambda params: agent_policy(agent, params, greedy=False)
-    self._play = make_player(env, self._policy)
+    self._play = make_player(
+      env, lambda params: agent_policy(agent, params, greedy=False)
+    )
     self._lap = time.monotonic()
     self.evaluation: dict[str, Any] = {}
 
@@ -82,18 +83,16 @@ class Reporter:
     began = time.monotonic()
     config, folder = self._config, self.folder
     params = sharding.local(state.learner.target_params)
-    figures = play_held_out(
+    played = play_held_out(
       self._env, self._play, params, episodes=config.eval_episodes, seed=EVAL_SEED
     )
-    self.evaluation = figures
+    self.evaluation = figures = figures_of(played)
     row = {f"eval/{name}": value for name, value in figures.items() if name != "ci95"}
     row["eval/ci95_low"], row["eval/ci95_high"] = figures["ci95"]
     self._writer.write(step, row | {"eval/wall_s": time.monotonic() - began})
     plot_curve(read_evaluations(folder.path), folder.curve, title=config.env.task)
     if config.video and last:
-      record_episodes(
-        self._env, self._policy(params), folder.videos / f"step_{step:08d}.mp4"
-      )
+      record_episodes(self._env, played, folder.videos / f"step_{step:08d}.mp4")
     rate = figures["success_rate"]
     self._progress.message(
       f"step {step:,}: {figures['successes']} of {figures['episodes']} held-out "

@@ -1,19 +1,26 @@
-"""Policies at work in the worlds: scans over time, batched over worlds."""
+"""Policies at work in the worlds: loops over time, batched over worlds."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
+from flax import struct
 import jax
 import jax.numpy as jnp
 
 from apnpql_jax.agents.learner import Agent
 from apnpql_jax.agents.networks import Params
-from apnpql_jax.env import Env, EnvState
+from apnpql_jax.env import Env
+from apnpql_jax.env_state import EnvState
+from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.types import ARM_DOF, Array, Slot
 
 Policy = Callable[[EnvState, Array], tuple[Array, Array]]
 """(worlds, key) -> actions f32[worlds, 7], their log densities f32[worlds]."""
+
+FILMED = 4
+"""Episodes of a batch that can be filmed: the first ones."""
 
 _LEAST_NOISE = 1e-6
 """Deviation in rad/s that stands for none: its density outweighs any policy's."""
@@ -66,3 +73,59 @@ def rollout(
     return env.step(state, action, env_key), slot
 
   return jax.lax.scan(period, state, jax.random.split(key, length))
+
+
+class Episodes(struct.PyTreeNode):
+  """One episode per world."""
+
+  success: Array  # bool[worlds]
+  length: Array  # i32[worlds]: control periods until success or time-out
+  states: PhysicsState  # [time, <= FILMED, ...]: instants 0 to ``length`` of the first
+
+
+Player = Callable[[Any, Array, Array], Episodes]
+"""(parameters of the policy, bank rows i32[worlds], key) -> episodes."""
+
+
+def make_player(env: Env, make_policy: Callable[[Any], Policy]) -> Player:
+  """A jitted function that plays one episode per row and stops when all are over.
+
+  What a world does after a fault is not counted.
+  """
+
+  @jax.jit
+  def play(params: Any, rows: Array, key: Array) -> Episodes:
+    policy = make_policy(params)
+
+    def instant(carry):
+      now, played, running, time, key = carry
+      state = env.arrive(now)
+      running &= state.faults == 0
+      played = Episodes(
+        success=played.success | running & state.timestep.terminated,
+        length=jnp.where(running, state.elapsed, played.length),
+        states=jax.tree.map(
+          lambda kept, x: jax.lax.dynamic_update_index_in_dim(
+            kept, x[: kept.shape[1]], time, axis=0
+          ),
+          played.states,
+          state.physics,
+        ),
+      )
+      key, policy_key, env_key = jax.random.split(key, 3)
+      now = env.advance(state, policy(state, policy_key)[0], env_key)
+      return now, played, running & ~state.timestep.last, time + 1, key
+
+    now, worlds = env.begin(rows), rows.shape[0]
+    shape = (env.config.episode_steps + 1, min(worlds, FILMED))
+    nothing = Episodes(
+      success=jnp.zeros(worlds, bool),
+      length=jnp.zeros(worlds, jnp.int32),
+      states=jax.tree.map(
+        lambda x: jnp.zeros(shape + x.shape[1:], x.dtype), now.physics
+      ),
+    )
+    start = (now, nothing, jnp.ones(worlds, bool), 0, key)
+    return jax.lax.while_loop(lambda carry: carry[2].any(), instant, start)[1]
+
+  return play

@@ -74,17 +74,10 @@ def per_device(function: Callable[..., Any], mesh: Mesh | None) -> Callable[...,
   if mesh is None:
     return function
 
-  def split(*args: Any, **kwargs: Any) -> Any:
-    spec = PartitionSpec(AXIS)
-    return jax.shard_map(
-      lambda args, kwargs: function(*args, **kwargs),
-      mesh=mesh,
-      in_specs=spec,
-      out_specs=spec,
-      check_vma=False,
-    )(args, kwargs)
-
-  return split
+  spec = PartitionSpec(AXIS)
+  return jax.shard_map(
+    function, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
+  )
 
 
 def local(tree: Any) -> Any:

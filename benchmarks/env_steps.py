@@ -25,7 +25,8 @@ import settings
 
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config import ConfigError, TrainConfig
-from apnpql_jax.env import Env, EnvState, make_env
+from apnpql_jax.env import Env, make_env
+from apnpql_jax.env_state import EnvState
 from apnpql_jax.rollout import Policy, agent_policy, rollout
 
 
@@ -51,7 +52,7 @@ def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
   env = make_env(config.env, instants=config.agent.lstm_instants)
   agent = make_agent(config.agent)
   worlds, length = config.env.worlds, config.rollout_length
-  state = jax.jit(env.reset)(jnp.arange(worlds) % env.bank_split)
+  state = env.reset(jnp.arange(worlds) % env.bank_split)
   params = jax.jit(agent.init)(jax.random.key(0), state.seen).params
   policies: dict[str, Callable[[Any], Policy]] = {
     "env": lambda params: parts.random_policy,

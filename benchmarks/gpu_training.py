@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config import AgentConfig, TrainConfig
 from apnpql_jax.env import make_env
-from apnpql_jax.evaluate import make_player, play_held_out
+from apnpql_jax.evaluate import figures_of, play_held_out
 from apnpql_jax.iteration import (
   collect_expert,
   empty_expert,
@@ -24,7 +24,7 @@ from apnpql_jax.iteration import (
   make_iteration,
 )
 from apnpql_jax.presets import load_preset
-from apnpql_jax.rollout import agent_policy
+from apnpql_jax.rollout import agent_policy, make_player
 
 
 def agent_config(settings: Settings) -> AgentConfig:
@@ -109,8 +109,9 @@ def train(settings: Settings) -> None:
     until = min(time.time() + terms["seconds"], terms["until"])
     state = _train_until(until, program, state, config)
     began = time.perf_counter()
-    figures = play_held_out(env, play, state.learner.params, episodes=episodes, seed=0)
-    emit(what="held-out episodes", seconds=time.perf_counter() - began, **figures)
+    played = play_held_out(env, play, state.learner.params, episodes=episodes, seed=0)
+    seconds = time.perf_counter() - began
+    emit(what="held-out episodes", seconds=seconds, **figures_of(played))
 
 
 def _train_until(until: float, program: Any, state: Any, config: TrainConfig) -> Any:

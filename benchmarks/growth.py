@@ -148,7 +148,7 @@ AXES = {
 
 def _period(config: EnvConfig, *, repeats: int) -> Timed:
   env = make_env(config)
-  state = jax.jit(env.reset)(jnp.arange(config.worlds) % env.bank_split)
+  state = env.reset(jnp.arange(config.worlds) % env.bank_split)
   run, _ = env_steps.player(env, lambda _: parts.random_policy, None, state, length=1)
   for _ in range(PLAYED):
     run()
@@ -181,7 +181,7 @@ def _update(config: AgentConfig, env: EnvConfig, *, repeats: int) -> Timed:
 
 def _images(config: EnvConfig, *, repeats: int) -> Timed:
   env = make_env(dataclasses.replace(config, obs="state"))
-  state = jax.jit(env.reset)(jnp.arange(config.worlds)).physics
+  state = env.reset(jnp.arange(config.worlds)).physics
   draw = functools.partial(parts.draw, env, config)
   run, _ = timing.compiled(jax.jit(draw), state)
   times = timing.measure(lambda: run(state), repeats=repeats)

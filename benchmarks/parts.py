@@ -22,7 +22,8 @@ from apnpql_jax.agents.learner import Agent
 from apnpql_jax.cameras import make_cameras
 from apnpql_jax.config import EnvConfig
 from apnpql_jax.contact_report import SUBSTEPS
-from apnpql_jax.env import Env, EnvState
+from apnpql_jax.env import Env
+from apnpql_jax.env_state import EnvState
 from apnpql_jax.rollout import agent_policy
 from apnpql_jax.sim.mjx import MjxPhysics
 from apnpql_jax.sim.physics import Physics, PhysicsState

@@ -23,7 +23,8 @@ import tables
 
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config import AgentConfig, EnvConfig
-from apnpql_jax.env import EnvState, make_env
+from apnpql_jax.env import make_env
+from apnpql_jax.env_state import EnvState
 from apnpql_jax.presets import load_preset
 from apnpql_jax.rollout import rollout
 from apnpql_jax.types import Array
@@ -39,7 +40,7 @@ def worlds(settings: dict[str, Any]) -> dict[str, sides.Measure]:
   )
   periods = settings["periods"]  # Per call.
   env = make_env(config)
-  start = jax.jit(env.reset)(jnp.arange(config.worlds) % env.bank_split)
+  start = env.reset(jnp.arange(config.worlds) % env.bank_split)
 
   @jax.jit
   def whole(state: EnvState, key: Array) -> EnvState:

@@ -62,11 +62,9 @@ def draw(sheet: Sheet, task: str, number: int) -> np.ndarray:
   """u8[H, W, 3]: a row of tiles."""
   env = make_env(dataclasses.replace(sheet.env, task=task, worlds=sheet.worlds))
   policy = expert_policy(env, noise=0.0)
-  play = jax.jit(
-    lambda rows, key: rollout(env, policy, env.reset(rows), key, length=PERIODS)[0]
-  )
+  play = jax.jit(lambda state, key: rollout(env, policy, state, key, length=PERIODS)[0])
   rows = number * sheet.worlds + jnp.arange(sheet.worlds)
-  observation = play(rows, jax.random.key(0)).timestep.observation
+  observation = play(env.reset(rows), jax.random.key(0)).timestep.observation
   tiles = zip(observation.global_image, observation.wrist_image, strict=True)
   return np.concatenate([_tile(*map(np.asarray, pair)) for pair in tiles], axis=1)
 

@@ -21,9 +21,9 @@ import apnpql_jax  # noqa: F401  isort: skip  (before JAX: sets threads and cach
 from apnpql_jax.config import EnvConfig
 from apnpql_jax.contact_report import contact_report
 from apnpql_jax.env import Env
-from apnpql_jax.evaluate import make_player, play_held_out
+from apnpql_jax.evaluate import play_held_out
 from apnpql_jax.primitives.bank import load_bank
-from apnpql_jax.rollout import expert_policy
+from apnpql_jax.rollout import expert_policy, make_player
 from apnpql_jax.tasks import make_task, task_names
 
 RESULT = Path(__file__).resolve().parent / "results" / "solver.json"
@@ -65,12 +65,12 @@ def measure(name: str, backend: str, setting: str, episodes: int) -> dict[str, f
   task.scene = dataclasses.replace(task.scene, fingerprint=setting)
   env = Env(config, task, bank)
   play = make_player(env, lambda _: expert_policy(env, noise=0.0))
-  figures = play_held_out(env, play, None, episodes=episodes, seed=0)
+  played = play_held_out(env, play, None, episodes=episodes, seed=0)
   report = contact_report(task, backends=(backend,))
   return {
     "episodes": episodes,
-    "successes": figures["successes"],
-    "mean_length": figures["mean_length"],
+    "successes": int(played.success.sum()),
+    "mean_length": float(played.length.mean()),
     "steps_per_s": report[f"{backend}_steps_per_s"],
   }
 

@@ -16,6 +16,8 @@ import time
 
 import apnpql_jax  # noqa: F401  isort: skip  (before JAX: sets threads and cache)
 import imageio.v3 as iio
+import jax
+import jax.numpy as jnp
 import numpy as np
 import tables
 
@@ -25,7 +27,7 @@ from apnpql_jax.env import Env, make_env
 from apnpql_jax.evaluate import evaluate_expert
 from apnpql_jax.primitives.bank import load_bank
 from apnpql_jax.recording import film, record_episodes
-from apnpql_jax.rollout import expert_policy
+from apnpql_jax.rollout import FILMED, expert_policy, make_player
 from apnpql_jax.tasks import make_task, task_names
 
 RESULTS = tables.RESULTS / "tasks"
@@ -101,10 +103,11 @@ def measure(
 
 def show(env: Env) -> None:
   """The expert's picture and video."""
-  policy = expert_policy(env, noise=0.0)
+  play = make_player(env, lambda _: expert_policy(env, noise=0.0))
+  played = play(None, env.bank_split + jnp.arange(FILMED), jax.random.key(0))
   folder = tables.ROOT / "docs" / "tasks"
-  record_episodes(env, policy, folder / f"{env.task.name}.mp4")
-  episode = film(env, policy)[0]
+  record_episodes(env, played, folder / f"{env.task.name}.mp4")
+  episode = film(env, played)[0]
   chosen = np.linspace(0, len(episode) - 1, INSTANTS).round().astype(int)
   around = (0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN), (0, 0)
   framed = np.pad(episode[chosen], around, constant_values=255)

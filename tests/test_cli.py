@@ -101,6 +101,9 @@ BAD_INPUT = [
   ("collect push_plate --noise -1", ["--noise"]),
   ("collect push_plate --noise nan", ["--noise"]),
   ("collect push_plate --episodes many", ["--episodes", "'many'"]),
+  ("collect push_plate --video runs", ["--video", ".mp4", ".gif"]),
+  ("collect push_plate --video runs/old/config.json/x.mp4", ["--video", "written"]),
+  ("evaluate runs/old --video x.avi", ["--video", ".mp4", ".gif"]),
   ("list tasks", ["tasks"]),
 ]
 

@@ -33,7 +33,7 @@ def test_a_period_goes_as_with_a_slot_for_every_point(name):
     return env.step(state, action, key), (state.physics, action)
 
   keys = jax.random.split(jax.random.key(0), PERIODS)
-  start = jax.jit(env.reset)(jnp.arange(WORLDS))
+  start = env.reset(jnp.arange(WORLDS))
   _, seen = jax.jit(lambda s: jax.lax.scan(period, s, keys))(start)
   worlds = np.arange(WORLDS)
   state, action = jax.tree.map(lambda x: x[worlds % PERIODS, worlds], seen)

@@ -18,6 +18,7 @@ from apnpql_jax import cli, demonstrations, recordings
 from apnpql_jax.config import ConfigError
 from apnpql_jax.demonstrations import Demonstrations
 from apnpql_jax.env import Env, make_env
+from apnpql_jax.rollout import expert_policy, make_player
 from apnpql_jax.sim.physics import START_TIME, Physics, PhysicsState
 
 ENV = dataclasses.replace(tiny.CONFIG.env, time_limit_s=0.9)
@@ -68,7 +69,7 @@ def test_the_replay_is_what_the_worlds_showed(demos, env):
   begin = np.flatnonzero(demos.first)
   rows = jax.random.split(jax.random.key(0))[0]
   rows = jax.random.randint(rows, (EPISODES,), 0, env.bank_split)
-  state, step = jax.jit(env.reset)(rows), jax.jit(env.step)
+  state, step = env.reset(rows), jax.jit(env.step)
   index = np.resize(np.arange(demos.instants), (worlds, length)).T
   for t in range(STEPS + 1):
     seen = jax.tree.map(np.asarray, state.timestep)
@@ -129,6 +130,17 @@ def test_an_episode_that_was_not_finite_is_left_out(demos, env):
   assert rest.first.sum() == EPISODES - 1
   for a, b in zip(rest, demos, strict=True):
     np.testing.assert_allclose(a, b[kept], atol=1e-5)
+
+
+def test_an_episode_ends_where_its_world_breaks(env):
+  broken = Env(env.config, env.task, env._bank)
+  broken.physics = Breaking(env.physics)
+  play = make_player(broken, lambda _: expert_policy(broken, noise=0.0))
+  played = play(None, jnp.arange(EPISODES), jax.random.key(0))
+  assert (played.length[2], played.success[2]) == (2, False)
+  sound = np.arange(EPISODES) != 2
+  assert (played.length[sound] == STEPS).all()
+  assert np.isfinite(played.states.qvel[:, 2]).all()
 
 
 WRONG = {

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from apnpql_jax.config import EnvConfig, ReplayConfig
-from apnpql_jax.env import HISTORY, Env, EnvState, make_env
-from apnpql_jax.evaluate import make_player, play_held_out
-from apnpql_jax.rollout import expert_policy
+from apnpql_jax.env import HISTORY, Env, make_env
+from apnpql_jax.env_state import EnvState
+from apnpql_jax.evaluate import play_held_out
+from apnpql_jax.rollout import expert_policy, make_player
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.tasks import task_names
 
@@ -48,8 +49,8 @@ def env(request) -> Env:
 def test_the_expert_solves_its_task(env, noise: float):
   """As it is, and with the noise by which it fills the replay of training."""
   player = make_player(env, lambda _: expert_policy(env, noise=noise))
-  figures = play_held_out(env, player, None, episodes=32, seed=0)
-  assert figures["successes"] >= 31
+  played = play_held_out(env, player, None, episodes=32, seed=0)
+  assert played.success.sum() >= 31
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +65,7 @@ def play(
 ) -> Iterator[EnvState]:
   """The instants of ``WORLDS`` episodes and what follows the shorter ones; the state
   before each period goes through ``disturb``."""
-  state = jax.jit(env.reset)(jnp.arange(WORLDS))
+  state = env.reset(jnp.arange(WORLDS))
   for t in range(env.config.episode_steps):
     state = step(state.replace(physics=disturb(t, state.physics)), jax.random.key(t))
     yield state

@@ -47,7 +47,7 @@ def test_a_carried_object_keeps_its_place_in_the_hand(env):
     action = env.expert_action(state)
     return action, env._kinematics(state.physics), env.step(state, action, key)
 
-  state = jax.jit(env.reset)(jnp.arange(WORLDS))
+  state = env.reset(jnp.arange(WORLDS))
   start = pose(state.physics, address)[0][:, 2]
   first: list[tuple | None] = [None] * WORLDS
   over = np.zeros(WORLDS, bool)
@@ -75,7 +75,7 @@ def test_a_carried_object_keeps_its_place_in_the_hand(env):
 
 def test_what_stands_on_the_table_stays(env):
   """Three seconds with the arm at rest: no drift, no jitter, nothing sinks."""
-  state = start = jax.jit(env.reset)(jnp.arange(WORLDS)).physics
+  state = start = env.reset(jnp.arange(WORLDS)).physics
   step = jax.jit(env.physics.step)
   model = env.task.scene.model
   free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)

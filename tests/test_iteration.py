@@ -264,7 +264,7 @@ def test_a_broken_world_starts_again_and_its_episode_is_never_drawn(
 
 def test_a_world_that_breaks_in_its_first_period_is_found(built, iteration, state):
   """C MuJoCo starts such a world over; its clock must not look like a first period."""
-  fresh = jax.jit(built.env.reset)(jnp.arange(WORLDS))
+  fresh = built.env.reset(jnp.arange(WORLDS))
   poisoned = _break_world(state.replace(env=fresh), "qvel", 1e12)
   after, metrics = iteration(poisoned)
   assert metrics["faults/worlds"] == 1

@@ -29,13 +29,14 @@ LOOP = {
 }
 """Modules that see both the world and the agent, or start those that do."""
 
-WORLD = {"sim", "render", "primitives", "tasks", "env"}
+WORLD = {"sim", "render", "primitives", "tasks", "env", "env_state"}
 FORBIDDEN = {
   "sim": LOOP | {"render", "primitives", "tasks", "env", "agents", "replay", "dists"},
   "render": LOOP | {"primitives", "tasks", "env", "agents", "replay", "dists"},
   "primitives": LOOP | {"env", "agents", "replay", "dists"},
   "tasks": LOOP | {"env", "agents", "replay", "dists"},
   "env": LOOP | {"agents", "replay", "dists"},
+  "env_state": LOOP | {"env", "agents", "replay", "dists"},
   "agents": LOOP | WORLD | {"replay"},
   "replay": LOOP | WORLD | {"agents", "dists"},
 }

@@ -17,7 +17,7 @@ from apnpql_jax.config import EnvConfig, RandomizationConfig
 from apnpql_jax.env import Env, make_env
 from apnpql_jax.randomization.draw import free_bodies
 from apnpql_jax.randomization.worlds import make_randomize
-from apnpql_jax.rollout import expert_policy, rollout
+from apnpql_jax.rollout import FILMED, expert_policy, make_player, rollout
 from apnpql_jax.sim import arm, physics
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.tasks import make_task, task_names
@@ -300,9 +300,12 @@ def test_with_all_ranges_zero_it_is_as_if_it_were_not_there(plain_env):
 
 
 def test_a_state_keeps_its_types(plain_env):
-  """So that one compilation serves every iteration."""
+  """So that one compilation serves every iteration, and a loop can play episodes."""
   config = dataclasses.replace(CONFIG, obs="pixels", shadows=True, randomize=True)
-  env = Env(config, plain_env.task, plain_env._bank)
+  env = Env(config, plain_env.task, plain_env._bank, instants=3)
+  play = make_player(env, lambda noise: expert_policy(env, noise=noise))
+  episodes = jax.eval_shape(play, 0.0, jnp.arange(4), jax.random.key(0))
+  assert episodes.states.command.shape == (config.episode_steps + 1, FILMED, 7)
   start = jax.eval_shape(env.reset, jnp.arange(4))
   after = jax.eval_shape(env.step, start, jnp.zeros((4, 7)), jax.random.key(0))
   types = lambda x: (x.shape, x.dtype, x.weak_type)  # noqa: E731

@@ -24,6 +24,7 @@ from apnpql_jax.config import (
   TrainConfig,
 )
 from apnpql_jax.evaluate import evaluate_run
+from apnpql_jax.recording import HOLD
 from apnpql_jax.train import train
 
 CONFIG = TrainConfig(
@@ -72,11 +73,15 @@ def test_a_run_leaves_everything_behind(finished):
   assert np.abs(frames[0].astype(int) - frames[8]).max() > 50
 
 
-def test_evaluate_reports_the_newest_checkpoint(finished):
+def test_evaluate_reports_the_newest_checkpoint(finished, tmp_path):
   run_dir, _ = finished
-  figures = evaluate_run(run_dir, episodes=6, seed=3, greedy=True)
+  video = tmp_path / "videos" / "four.mp4"
+  figures = evaluate_run(run_dir, episodes=4, seed=3, greedy=True, video=video)
   assert figures["checkpoint_step"] == 64
-  assert figures["episodes"] == 6 and figures["greedy"]
+  assert figures["episodes"] == 4 and figures["greedy"]
+  # All instants of all four, the last of each held.
+  frames = len(iio.imread(next(video.parent.iterdir())))
+  assert frames == 4 * (figures["mean_length"] + HOLD)
   assert figures["backend"] == "native" and figures["algorithm"] == "ap_npql"
   low, high = figures["ci95"]
   assert 0 <= low <= figures["success_rate"] <= high <= 1

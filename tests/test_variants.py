@@ -112,7 +112,7 @@ def env(request) -> Env:
 
 def test_every_reset_draws_a_shape_without_recompilation(env):
   worlds = 16
-  state = jax.jit(env.reset)(jnp.arange(worlds))
+  state = env.reset(jnp.arange(worlds))
   still, seen, fresh = jnp.zeros((worlds, 7)), [], []
   # Compiled ahead of time: it refuses what would need another compilation.
   env_step = jax.jit(env.step).lower(state, still, jax.random.key(0)).compile()
