@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import importlib.util
+import os
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -114,6 +115,9 @@ def write_video(path: str | Path, frames: np.ndarray, *, fps: float) -> Path:
   path = path.with_suffix(".mp4")
   padding = [-side % _MACROBLOCK for side in frames.shape[1:3]]
   frames = np.pad(frames, ((0, 0), (0, padding[0]), (0, padding[1]), (0, 0)))
+  # Else it starts ffmpeg by running Python in a fork, where a thread of JAX may have
+  # left a lock behind.
+  os.environ.setdefault("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")
   # The range of quality is 0 to 10. Flat colours and hard edges need a high one.
   iio.imwrite(path, frames, plugin="FFMPEG", fps=fps, codec="libx264", quality=8)
   return path
