@@ -19,6 +19,7 @@ from typing import Any
 import timing  # isort: skip  (before JAX: sets threads and cache)
 import floor
 import jax
+import modules
 import parts
 import settings
 
@@ -69,10 +70,10 @@ def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
   iterations = timing.Carried(run, state)
   times = timing.measure(iterations, repeats=repeats)
   state = iterations.carry
-  found = parts.measure(env, agent, state.learner.params, state.env, repeats=repeats)
-  learning = learn(config, agent, state, repeats)
-  seconds = {name: length * part.seconds for name, part in found.items()}
-  floor_s = length * sum(part.floor_s for part in found.values())
+  period = parts.measure(env, agent, state.learner.params, state.env, repeats=repeats)
+  found = {name: part.times(length) for name, part in period.items()}
+  found["learning"], by_module = learn(config, agent, state, repeats)
+  floor_s = sum(part.floor_s for part in found.values())
   return {
     "rollout_length": length,
     "updates_per_iteration": updates,
@@ -80,15 +81,20 @@ def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
     **times.per(worlds * length).rate("step"),
     **times.per(updates).rate("update"),
     "compile_s": compile_s,
-    **floor.compare(floor_s + learning.floor_s, times.seconds),
-    "shares": parts.shares(times.seconds, seconds | {"learning": learning.seconds}),
+    **floor.compare(floor_s, times.seconds),
+    "parts": parts.shares(times.seconds, found),
+    "modules": by_module,
   }
 
 
 def learn(
   config: TrainConfig, agent: Agent, state: TrainState, repeats: int
-) -> parts.Part:
-  """The updates of an iteration by themselves: batches are drawn and learnt from."""
+) -> tuple[parts.Part, dict[str, float]]:
+  """The updates of an iteration by themselves: batches are drawn and learnt from.
+
+  Returns:
+    the part of the iteration, and its share of each module, see ``modules.shares``.
+  """
   sample = make_sample(config, agent)
   key = jax.random.key(0)
 
@@ -105,7 +111,8 @@ def learn(
   times = timing.measure(carried, repeats=repeats)
   batch = jax.eval_shape(sample, *rings, key)
   work = floor.count(agent.update, state.learner, batch, key).times(count)
-  return parts.Part(times.seconds, work.seconds())
+  by_module = modules.shares(run, carried)
+  return parts.Part(times.seconds, work.seconds()), by_module
 
 
 if __name__ == "__main__":

@@ -75,8 +75,7 @@ def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
       **floor.compare(floor_s / worlds, times.seconds),
     }
   period_s = worlds / figures["env_policy"]["steps_per_s"]
-  seconds = {name: part.seconds for name, part in found.items()}
-  return figures | {"shares": parts.shares(period_s, seconds)}
+  return figures | {"parts": parts.shares(period_s, found)}
 
 
 def player(

@@ -90,7 +90,7 @@ def train(settings: Settings) -> None:
   ):
     first = pool.submit(compiled)
     player = pool.submit(
-      lambda: play.lower(example.learner.params, rows, key).compile()
+      lambda: play.lower(example.learner.target_params, rows, key).compile()
     )
     state = initial_state(config, env, agent, collect_expert)
     (program, compile_s), play = first.result(), player.result()
@@ -109,7 +109,9 @@ def train(settings: Settings) -> None:
     until = min(time.time() + terms["seconds"], terms["until"])
     state = _train_until(until, program, state, config)
     began = time.perf_counter()
-    played = play_held_out(env, play, state.learner.params, episodes=episodes, seed=0)
+    played = play_held_out(
+      env, play, state.learner.target_params, episodes=episodes, seed=0
+    )
     seconds = time.perf_counter() - began
     emit(what="held-out episodes", seconds=seconds, **figures_of(played))
 

@@ -16,6 +16,7 @@ import argparse
 from collections.abc import Iterator
 import dataclasses
 import itertools
+import math
 import sys
 from typing import Any
 from unittest import mock
@@ -102,7 +103,7 @@ def measure(
 
   run, compile_s = timing.compiled(jax.jit(updates), state, 1)
   once = timing.measure(lambda: run(state, 1), repeats=1, seconds=0.0)
-  count = max(1, round(timing.SECONDS / once.seconds))
+  count = math.ceil(timing.SECONDS / once.seconds)
   times = timing.measure(lambda: run(state, count), repeats=repeats, seconds=0.0)
   work = floor.count(agent.update, state, transitions, key)
   return times.per(count), compile_s, work.seconds()

@@ -34,10 +34,14 @@ _substep_flops: dict[tuple[str, bool], float] = {}
 
 
 class Part(NamedTuple):
-  """A part of a control period of all worlds."""
+  """A part of a control period or of an iteration, of all worlds."""
 
   seconds: float  # measured
   floor_s: float  # the least possible
+
+  def times(self, count: float) -> Part:
+    """The same, ``count`` times."""
+    return Part(count * self.seconds, count * self.floor_s)
 
 
 def random_policy(state: EnvState, key: Array) -> tuple[Array, Array]:
@@ -90,11 +94,22 @@ def _timed(
   return Part(times.seconds, (work or floor.count(function, *args)).seconds())
 
 
-def shares(whole_s: float, parts: dict[str, float]) -> dict[str, float]:
-  """Each part's share of the whole, and the rest's; parts may add up to more."""
-  total = max(whole_s, sum(parts.values()))
-  found = {name: seconds / total for name, seconds in parts.items()}
-  return found | {"rest": (total - sum(parts.values())) / total}
+def shares(whole_s: float, parts: dict[str, Part]) -> dict[str, dict[str, float]]:
+  """For the report: each part, and its share of the whole; and the share of the rest.
+
+  Parts may add up to more than the whole, of which there is no rest then.
+  """
+  sum_s = sum(part.seconds for part in parts.values())
+  total_s = max(whole_s, sum_s)
+  found = {
+    name: {
+      "share": part.seconds / total_s,
+      "seconds": part.seconds,
+      **floor.compare(part.floor_s, part.seconds),
+    }
+    for name, part in parts.items()
+  }
+  return found | {"rest": {"share": (total_s - sum_s) / total_s}}
 
 
 def physics_work(engine: Physics, state: PhysicsState) -> floor.Work:

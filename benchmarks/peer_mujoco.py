@@ -20,7 +20,15 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from peer_worlds import CONTROL_PERIOD_S, RESETS, Processes, World, export, load
+from peer_worlds import (
+  CONTROL_PERIOD_S,
+  EPISODE_STEPS,
+  RESETS,
+  Processes,
+  World,
+  export,
+  load,
+)
 import sides
 
 VELOCITY_GAIN, MAX_ACCELERATION = 25.0, 1.2
@@ -138,7 +146,7 @@ def gymnasium_env(folder: Path, *, images: bool) -> Any:
       self._steps += 1
       command = np.append(action[:6], float(action[6] > 0))
       seen = self._env.step(command, images=images)
-      return seen, 0.0, False, self._steps >= 93, {}
+      return seen, 0.0, False, self._steps >= EPISODE_STEPS, {}
 
   return Table()
 

@@ -142,7 +142,7 @@ def env_steps(report: Report) -> str:
       *(result[name] for name in SETTING),
       *rate(result["env"], "steps"),
       *rate(result["env_policy"], "steps"),
-      *(percent(result["shares"].get(part, 0.0)) for part in parts),
+      *(_part(result["parts"].get(part)) for part in parts),
     )
     for result in report["results"]
   ]
@@ -152,13 +152,16 @@ def env_steps(report: Report) -> str:
 def end_to_end(report: Report) -> str:
   """Steps and updates per second of training."""
   parts = _parts(report)
-  head = (*SETTING, "steps/s", "limit", "reached", "updates/s", *parts)
+  modules = report["results"][0]["modules"]
+  within = [f"of learning: {name}" for name in modules]
+  head = (*SETTING, "steps/s", "limit", "reached", "updates/s", *parts, *within)
   rows = [
     (
       *(result[name] for name in SETTING),
       *rate(result, "steps"),
       spread(result, "updates_per_s"),
-      *(percent(result["shares"].get(part, 0.0)) for part in parts),
+      *(_part(result["parts"].get(part)) for part in parts),
+      *(percent(result["modules"].get(name, 0.0)) for name in modules),
     )
     for result in report["results"]
   ]
@@ -302,5 +305,13 @@ def note(report: Report) -> str:
 
 def _parts(report: Report) -> list[str]:
   """Names of all parts that some result has, the rest last."""
-  names = {name: None for result in report["results"] for name in result["shares"]}
+  names = {name: None for result in report["results"] for name in result["parts"]}
   return [*(name for name in names if name != "rest"), "rest"]
+
+
+def _part(part: dict[str, float] | None) -> str:
+  """Its share of the whole and, but for the rest, what it reaches of its limit."""
+  if part is None:
+    return ""
+  share = percent(part["share"])
+  return f"{share} ({percent(part['of_floor'])})" if "of_floor" in part else share

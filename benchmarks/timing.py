@@ -12,6 +12,7 @@ import argparse
 from collections.abc import Callable, Iterable, Mapping, Sequence
 import dataclasses
 import json
+import math
 import statistics
 import time
 from typing import Any
@@ -111,7 +112,7 @@ def measure(run: Callable[[], Any], *, repeats: int, seconds: float = SECONDS) -
     seconds: least time of a repeat.
   """
   _time(run, 1)
-  calls = max(1, round(seconds / _time(run, 1)[0]))
+  calls = max(1, math.ceil(seconds / _time(run, 1)[0]))
   pairs = [_time(run, calls) for _ in range(repeats)]
   wall, cpu = zip(*pairs, strict=True)
   return Times(wall, cpu).per(calls)

@@ -90,9 +90,10 @@ def test_a_benchmark_reports_what_can_be(script, args):
     for name in [key[:-4] for key in entry if key.endswith("_low")]:
       assert 0 < entry[f"{name}_low"] <= entry[name] <= entry[f"{name}_high"]
       spreads += 1
-    if "shares" in entry:
-      assert all(0 <= share <= 1 for share in entry["shares"].values())
-      assert sum(entry["shares"].values()) == pytest.approx(1.0)
+    if "parts" in entry:
+      shares = [part["share"] for part in entry["parts"].values()]
+      assert all(0 <= share <= 1 for share in shares)
+      assert sum(shares) == pytest.approx(1.0)
     if "floor_s" in entry:
       assert entry["floor_s"] > 0 and entry["of_floor"] > 0
   assert spreads
@@ -148,9 +149,12 @@ def test_times_are_of_one_call():
 
 
 def test_shares_add_up_even_if_parts_are_slower_alone():
-  assert parts.shares(4.0, {"a": 1.0, "b": 2.0}) == {"a": 0.25, "b": 0.5, "rest": 0.25}
-  shares = parts.shares(2.0, {"a": 1.0, "b": 3.0})
-  assert shares == {"a": 0.25, "b": 0.75, "rest": 0.0}
+  def shares(whole_s: float, **seconds: float) -> list[float]:
+    found = {name: parts.Part(x, floor_s=0.5) for name, x in seconds.items()}
+    return [part["share"] for part in parts.shares(whole_s, found).values()]
+
+  assert shares(4.0, a=1.0, b=2.0) == [0.25, 0.5, 0.25]
+  assert shares(2.0, a=1.0, b=3.0) == [0.25, 0.75, 0.0]
 
 
 def test_the_soak_sees_metrics_that_were_put_aside_and_every_other_loss(tmp_path):
@@ -189,9 +193,11 @@ def test_the_document_is_made_of_what_is_at_hand(tmp_path):
   speed = {"steps_per_s": 50.0, "steps_per_s_low": 40.0, "steps_per_s_high": 60.0}
   speed |= {"floor_s": 0.001, "of_floor": 0.05}
   setting = {"task": "t", "backend": "mjx", "obs": "pixels", "worlds": 4}
-  shares = {"physics": 0.6, "rest": 0.4}
-  steps = {**setting, "env": speed, "env_policy": speed, "shares": shares}
-  training = setting | speed | {"updates_per_s": 9.0, "shares": shares}
+  found = {"physics": {"share": 0.6, "of_floor": 0.03}, "rest": {"share": 0.4}}
+  steps = {**setting, "env": speed, "env_policy": speed, "parts": found}
+  modules = {"Encoder": 0.7, "other": 0.3}
+  learnt = {"updates_per_s": 9.0, "parts": found, "modules": modules}
+  training = setting | speed | learnt
   points = [
     {
       "axis": "worlds",
@@ -220,7 +226,8 @@ def test_the_document_is_made_of_what_is_at_hand(tmp_path):
   assert text.count("as before") == len(report.SECTIONS) - len(reports)
   assert "| PyBullet, TinyRenderer | 1 | 72x96 |  | missing: no module |  |  |" in text
   assert "| t | mjx | pixels | 4 | 50 (40 to 60) | 1,000 | 5 % |" in text
-  assert "| 60 % | 40 % |" in text
+  assert "| 60 % (3 %) | 40 % |" in text
+  assert "| 60 % (3 %) | 40 % | 70 % | 30 % |" in text
   assert "2 GFLOP/s and 1 GB/s" in text
   # Half of proportional from 1 to 4, proportional from there on.
   assert "| 4 | 200 (200 to 200) | 0.50 | 50 % |" in text
