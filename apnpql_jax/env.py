@@ -70,7 +70,7 @@ class Env:
     self._chain = arm.make_chain(scene)
     self._kinematics = make_kinematics(scene)
     self._cameras = make_cameras(config, scene)
-    # Both keep one trace for each number of worlds; outside jit they are compiled.
+    # Traced once for each number of worlds; called outside jit, they are compiled.
     self._arrive = sharding.per_device(jax.jit(self._judge_and_observe), mesh)
     self._reset = jax.jit(lambda rows: self.arrive(self.begin(rows)))
     self._randomize = None
@@ -102,17 +102,18 @@ class Env:
     return self._reset(rows)
 
   def step(self, state: EnvState, action: Array, key: Array) -> EnvState:
-    """One control period in every world.
-
-    Args:
-      state: [worlds, ...].
-      action: f32[worlds, 7], see ``types.ACTION_DIM``.
-      key: draws the rows of worlds that start again.
-    """
+    """One control period in every world; arguments are those of ``advance``."""
     return self.arrive(self.advance(state, action, key))
 
   def begin(self, rows: Array) -> Arrival:
-    """The first instants of one world per bank row; see ``reset``."""
+    """The first instants of one world per bank row.
+
+    Args:
+      rows: i32[worlds].
+
+    Returns:
+      [worlds, ...]; ``arrive`` makes of it what ``reset`` returns.
+    """
     count = rows.shape[0]
     keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), rows)
     first = Arrival(
@@ -132,7 +133,16 @@ class Env:
     return first.replace(recent=jax.tree.map(self._repeated, empty))
 
   def advance(self, state: EnvState, action: Array, key: Array) -> Arrival:
-    """Where a control period leads every world; see ``step``."""
+    """Where a control period leads every world.
+
+    Args:
+      state: [worlds, ...].
+      action: f32[worlds, 7], see ``types.ACTION_DIM``.
+      key: draws the rows of worlds that start again.
+
+    Returns:
+      [worlds, ...]; ``arrive`` makes of it what ``step`` returns.
+    """
     physics_step = sharding.per_device(self.physics.step, self.mesh)
     moved = physics_step(state.physics, action[:, :6], action[:, 6])
     broken = ~state.timestep.last & ~self._sound(state, action, moved)
@@ -166,7 +176,7 @@ class Env:
     )
 
   def arrive(self, arrival: Arrival) -> EnvState:
-    """Judges, labels and observes the instant the worlds have come to."""
+    """Judges, labels and observes the instant that [worlds, ...] have come to."""
     state = self._arrive(arrival.replace(recent=None))
     if arrival.recent is None:
       return state

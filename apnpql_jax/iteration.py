@@ -187,7 +187,9 @@ def initial_state(
   rows = jax.random.randint(row_key, (config.env.worlds,), 0, env.bank_split)
 
   @jax.jit
-  def start(worlds: EnvState, key: Array, init_key: Array, fault_key: Array):
+  def start(
+    worlds: EnvState, key: Array, init_key: Array, fault_key: Array
+  ) -> TrainState:
     length = config.replay.capacity // config.env.worlds
     state = TrainState(
       learner=agent.init(init_key, worlds.seen),

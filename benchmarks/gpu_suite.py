@@ -206,16 +206,17 @@ def store(path: Path) -> None:
   """Keeps a report in ``benchmarks/results``; ``report.py`` makes the table of it."""
   import tables  # Needs what may have to be taken from the wheels elsewhere.
 
-  tables.store("gpu_suite", json.loads(path.read_text()))
+  report = json.loads(path.read_text())
+  if report["arguments"]["quick"]:
+    sys.exit("--quick figures mean nothing; nothing is stored")
+  tables.store("gpu_suite", report)
 
 
 def rows(report: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
   """A line for every figure, and for what there is none of."""
   for name, entry in report["sections"].items():
     for result in entry["results"]:
-      note = result.get("error", "" if result.get("quiet", True) else "others compiled")
-      if "success_rate" in result:
-        note = f"{100 * result['success_rate']:.0f} % of episodes solved"
+      note = "; ".join(_notes(result))
       unit = next((key for key in result if key.endswith("_per_s")), None)
       figure = (unit.removesuffix("_per_s"), result[unit]) if unit else ("", "")
       size = result.get("program_gib", "")
@@ -225,6 +226,19 @@ def rows(report: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
       yield name, what, "", "", "", "", entry["status"]
     if not entry["results"] and entry.get("status") != "done":
       yield name, "", "", "", "", "", entry.get("status", "")
+
+
+def _notes(result: dict[str, Any]) -> Iterator[str]:
+  if "error" in result:
+    yield result["error"]
+  if not result.get("quiet", True):
+    yield "others compiled"
+  if "success_rate" in result:
+    yield f"{100 * result['success_rate']:.0f} % of episodes solved"
+  if "qpos_differs" in result:
+    yield f"{result['qpos_differs']:.2g} m or rad from C MuJoCo"
+  if "peak_gib" in result:
+    yield f"process {result['peak_gib']:.2g} GiB"
 
 
 def _run_all(

@@ -1,6 +1,7 @@
 """What devices send to each other in one update of a preset.
 
   python benchmarks/messages.py --preset push_plate --devices 4
+  python benchmarks/messages.py --store     # keeps it, and its table in docs/scaling.md
 
 Read from the program that XLA makes for that many CPU devices; nothing is run. Bytes
 are those of what each device holds afterwards: the whole gradients, its whole batch.
@@ -17,6 +18,7 @@ from typing import Any
 
 import apnpql_jax  # noqa: F401  isort: skip  (before JAX: sets threads and cache)
 import jax
+import tables
 
 from apnpql_jax import leaves, sharding
 from apnpql_jax.agents.learner import make_agent
@@ -34,9 +36,14 @@ def main() -> None:
   parser.add_argument("--json", action="store_true", help="print one JSON object")
   parser.add_argument("--preset", default="push_plate")
   parser.add_argument("--devices", type=int, default=4)
+  parser.add_argument("--store", action="store_true", help="keep it, and its table")
   args = parser.parse_args()
   jax.config.update("jax_num_cpu_devices", args.devices)
   report = {"preset": args.preset, "devices": args.devices, **measure(args)}
+  if args.store:
+    report = tables.machine() | report
+    tables.store("messages", report)
+    tables.put("messages", table(report), tables.ROOT / "docs" / "scaling.md")
   if args.json:
     print(json.dumps(report))
   else:
@@ -65,6 +72,22 @@ def measure(args: argparse.Namespace) -> dict[str, int]:
     "messages_bytes": sum(map(size, sent)),
     "largest_message_bytes": max(map(size, sent)),
   }
+
+
+def table(report: dict[str, Any]) -> str:
+  """What docs/scaling.md says of a report."""
+  sent = f"sent, in {report['messages']} messages"
+  replay = "for comparison: the agent's replay, its part on each device"
+  rows = [
+    ("parameters, and so gradients", report["parameters_bytes"]),
+    ("batch", report["batch_bytes"]),
+    (sent, report["messages_bytes"]),
+    (replay, report["replay_bytes_per_device"]),
+  ]
+  about = f"{report['preset']} on {report['devices']} devices, "
+  about += f"jax {report['versions']['jax']}, commit {report['commit']}."
+  cells = [(name, f"{size:,}") for name, size in rows]
+  return f"{about}\n\n{tables.table(('of one update', 'bytes'), cells)}"
 
 
 def messages(program: Any) -> list[str]:

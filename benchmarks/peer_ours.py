@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import contextlib
 import dataclasses
+import functools
 import json
 import sys
 from typing import Any
@@ -16,6 +17,7 @@ import apnpql_jax  # noqa: F401  isort: skip  (before JAX: sets threads and cach
 from cures import cures
 import jax
 import jax.numpy as jnp
+from learner import nth_update
 import parts
 from peer_worlds import EPISODE_STEPS
 import sides
@@ -27,7 +29,7 @@ from apnpql_jax.env import make_env
 from apnpql_jax.env_state import EnvState
 from apnpql_jax.presets import load_preset
 from apnpql_jax.rollout import rollout
-from apnpql_jax.types import Array
+from apnpql_jax.types import Array, Transition
 
 sys.path.append(str(tables.ROOT / "tests"))
 from batches import random_batch  # noqa: E402  (the noise that the tests use)
@@ -63,7 +65,7 @@ def worlds(settings: dict[str, Any]) -> dict[str, sides.Measure]:
 
 
 def learner(settings: dict[str, Any]) -> dict[str, sides.Measure]:
-  """Updates on a batch of noise, in a scan of as many as an iteration has."""
+  """Updates on a batch of noise, in a loop of as many as an iteration has."""
   preset = load_preset(settings["preset"])
   agent = make_agent(learner_config(settings))
   count = preset.updates_per_iteration
@@ -71,15 +73,12 @@ def learner(settings: dict[str, Any]) -> dict[str, sides.Measure]:
   state = agent.init(jax.random.key(0), batch.observation_tm1)
 
   @jax.jit
-  def updates(state: Any, key: Array) -> Any:
-    def update(state: Any, key: Array) -> tuple[Any, Array]:
-      state, metrics = agent.update(state, batch, key)
-      return state, metrics["loss/q"]
-
-    return jax.lax.scan(update, state, jax.random.split(key, count))
+  def updates(state: Any, batch: Transition) -> Any:
+    update = functools.partial(nth_update, agent, batch)
+    return jax.lax.fori_loop(0, count, update, state)
 
   def run() -> None:
-    jax.block_until_ready(updates(state, jax.random.key(1)))
+    jax.block_until_ready(updates(state, batch))
 
   return {"updates": sides.rate_of(run, count)}
 

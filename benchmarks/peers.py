@@ -90,7 +90,8 @@ PEERS = {
     draws=True,
   ),
   "mjx": Peer(
-    f"mujoco.mjx as it is installed, against our MJX engine; {_MJX['worlds']} worlds",
+    "mujoco.mjx as it is installed, with the settings of our scene, against our MJX "
+    f"engine; {_MJX['worlds']} worlds",
     "peer_ours.py",
     ("physics",),
     _MJX,

@@ -20,6 +20,7 @@ from typing import Any
 from unittest import mock
 
 import timing  # isort: skip  (before JAX: sets threads and cache)
+import floor
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -53,7 +54,8 @@ def measure_all(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
   scene = load_scene(mjcf_path(SCENE))
   for batch in args.batch:
     poses = make_poses(scene, batch)
-    expected = jax.jit(make_pair(scene, SIZES))(poses)
+    plain = make_pair(scene, SIZES)
+    floor_s, expected = floor.count(plain, poses).seconds(), jax.jit(plain)(poses)
     for name in args.layouts:
       layout = LAYOUTS[name]
       with layout.traced():
@@ -61,12 +63,13 @@ def measure_all(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         run, compile_s = timing.compiled(pair, poses, options=layout.options)
       times = timing.measure(functools.partial(run, poses), repeats=args.repeats)
       drawn = zip(run(poses), expected, strict=True)
-      same = [(images == plain).all(-1).ravel() for images, plain in drawn]
+      same = [(images == others).all(-1).ravel() for images, others in drawn]
       yield {
         "layout": name,
         "batch": batch,
         **times.per(batch).rate("pair"),
         "compile_s": compile_s,
+        **floor.compare(floor_s, times.seconds),
         "agreeing": float(jnp.concatenate(same).mean()),
       }
 

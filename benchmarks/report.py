@@ -73,6 +73,8 @@ def write(results: Path = tables.RESULTS, docs: Path = tables.PERFORMANCE) -> No
   }
   for name, report in found.items():
     tables.put(name, SECTIONS[name](report), docs)
+  if found.keys() >= set(sections.COST_REPORTS):
+    tables.put("costs", sections.costs(found), docs)
   images = docs.parent / "images"
   images.mkdir(exist_ok=True)
   if "growth" in found:

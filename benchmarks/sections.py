@@ -18,6 +18,9 @@ RENDERERS = {
   "mujoco_osmesa": "MuJoCo, OSMesa",
   "pybullet_tiny": "PyBullet, TinyRenderer",
 }
+COST_REPORTS = ("learner", "encoder_layouts", "peers", "ray_layouts")
+"""Of which ``costs`` is made."""
+
 SETTING = ("task", "backend", "obs", "worlds")
 SIZES = {
   "worlds": "worlds",
@@ -60,26 +63,34 @@ def fidelity(report: Report) -> str:
 
 
 def render(report: Report) -> str:
-  """Pairs of images per second."""
-  head = ("renderer", "batch", "images", "shadow", "pairs/s", "limit", "reached")
+  """Pairs of images per second; of other renderers, how many times ours draws."""
+  columns = ("renderer", "batch", "images", "shadow", "pairs/s", "limit", "reached")
+  head = (*columns, "times as fast")
   rows = []
-  for result in report["results"]:
-    sizes = report["resolutions"][result["resolution"]].values()
-    images = " + ".join(f"{height}x{width}" for height, width in sizes)
-    shadow = "of the hand" if result.get("shadow") else ""
-    label = (RENDERERS[result["renderer"]], result.get("batch", 1), images, shadow)
-    rows.append((*label, *rate(result, "pairs")))
+  for name, sizes in report["resolutions"].items():
+    images = " + ".join(f"{height}x{width}" for height, width in sizes.values())
+    results = [r for r in report["results"] if r["resolution"] == name]
+    ours = [r for r in results if r["renderer"] == "ray_caster"]
+    fastest = max((r["pairs_per_s"] for r in ours), default=0.0)
+    for result in results:
+      shadow = "of the hand" if result.get("shadow") else ""
+      label = (RENDERERS[result["renderer"]], result.get("batch", 1), images, shadow)
+      if result in ours or "missing" in result:
+        rows.append((*label, *rate(result, "pairs"), ""))
+      else:
+        rows.append((*label, "", "", "", fastest / result["pairs_per_s"]))
   return f"{report['scene']}. {note(report)}\n\n{table(head, rows)}"
 
 
 def ray_layouts(report: Report) -> str:
   """Pairs of images per second by the layout of the ray caster's work."""
-  head = ("layout", "batch", "pairs/s", "compilation, s", "pixels as in use")
+  columns = ("layout", "batch", "pairs/s", "limit", "reached")
+  head = (*columns, "compilation, s", "pixels as in use")
   rows = [
     (
       result["layout"],
       result["batch"],
-      spread(result, "pairs_per_s"),
+      *rate(result, "pairs"),
       result["compile_s"],
       f"{100 * result['agreeing']:.2f} %",
     )
@@ -215,18 +226,70 @@ def growth(report: Report) -> str:
   return "\n\n".join([note(report), "![growth](images/growth.png)", *tables])
 
 
+def costs(reports: dict[str, Report]) -> str:
+  """What was done about the largest costs, of the reports of ``COST_REPORTS``."""
+
+  def find(name: str, **setting: Any) -> dict[str, Any]:
+    results = reports[name]["results"]
+    return next(result for result in results if setting.items() <= result.items())
+
+  def row(
+    name: str, cost: str, before: dict[str, Any], after: dict[str, Any], cure: str
+  ) -> tuple[Any, ...]:
+    unit = "pairs" if name == "ray_layouts" else "updates"
+    slow, fast = (find(name, **x)[f"{unit}_per_s"] for x in (before, after))
+    figures = (f"{number(slow)} {unit}/s", number(fast), fast / slow)
+    return (cost, *figures, cure, f"`{name}.py`")
+
+  head = ("cost", "before", "after", "times", "what does it", "benchmark")
+  update = {"batch": 64, "candidates": 120}
+  stock = next(r for r in reports["peers"]["results"] if "mujoco.mjx" in r["peer"])
+  rows = [
+    row(
+      "learner",
+      "values of 120 candidates, batch 64",
+      update | {"phi": "repeated"},
+      update | {"phi": "once"},
+      "phi once per observation, first layer split",
+    ),
+    row(
+      "encoder_layouts",
+      "images in an update, batch 64",
+      {"layout": "4x4 / 4, 2x2 / 2 by XLA"},
+      {"layout": "4x4 / 4, 2x2 / 2"},
+      "convolutions as products of matrices",
+    ),
+    (
+      *("physics by MJX, 16 worlds", "", "", stock["ratio"]),
+      *("a barrier behind each body, cones in blocks", "`peers.py`"),
+    ),
+    row(
+      "ray_layouts",
+      "both cameras, 32 worlds",
+      {"layout": "fold, 1 block", "batch": 32},
+      {"layout": "fold, 4 blocks", "batch": 32},
+      "four blocks of pixels instead of one",
+    ),
+  ]
+  return table(head, rows)
+
+
 def peers(report: Report) -> str:
   """Ratios of this project's rates to those of others."""
-  head = ("peer", "rate", "ours / theirs", "over rounds")
+  head = ("peer", "with", "rate", "ours / theirs", "over rounds")
   rows = [
-    (result["peer"], result.get("rate", "-"), *_ratio(result))
+    (
+      result["peer"],
+      ", ".join(f"{name} {value}" for name, value in result.get("about", {}).items()),
+      result.get("rate", "-"),
+      *_ratio(result),
+    )
     for result in report["results"]
   ]
   about = (
-    f"{report['task']}, {report['device']}, {report['cores']} cores, commit "
-    f"{report['commit'] or 'unknown'}; theirs in {report['processes']} processes, ours "
-    f"with {report['worlds']} worlds; updates of batch {report['batch']} with "
-    f"{report['candidates']} candidates."
+    f"{report['task']}. {machine(report)}; theirs in {report['processes']} processes, "
+    f"ours with {report['worlds']} worlds; updates of batch {report['batch']} with "
+    f"{report['candidates']} candidates; medians of {report['rounds']} rounds."
   )
   return f"{about}\n\n{table(head, rows)}"
 
@@ -242,7 +305,10 @@ def _ratio(result: dict[str, Any]) -> tuple[Any, str]:
 def gpu(report: Report) -> str:
   """All that the suite found on a GPU."""
   head = ("section", "figure", "per second", "", "compile s", "GiB", "note")
-  return f"Commit {report['commit']}.\n\n{table(head, gpu_suite.rows(report))}"
+  found = report["sections"]["device"]["results"]
+  device = next(result for result in found if result["what"] == "device")
+  about = f"{device['kind']}, {_versions(device)}, commit {report['commit']}."
+  return f"{about}\n\n{table(head, gpu_suite.rows(report))}"
 
 
 def curves(report: Report) -> dict[str, dict[str, list[dict[str, Any]]]]:
@@ -291,16 +357,26 @@ def percent(share: float) -> str:
   return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"
 
 
+def machine(report: Report) -> str:
+  """On what a report was measured, and with what."""
+  return (
+    f"{report['device']}, {report['cores']} cores, {_versions(report)}, commit "
+    f"{report['commit'] or 'unknown'}"
+  )
+
+
 def note(report: Report) -> str:
   """The machine and what it can do."""
-  versions = ", ".join(f"{name} {x}" for name, x in report["versions"].items())
   peak = report["peak"]
   return (
-    f"{report['device']}, {report['cores']} cores, {versions}, commit "
-    f"{report['commit'] or 'unknown'}; {number(peak['flops_per_s'] / 1e9)} GFLOP/s and "
+    f"{machine(report)}; {number(peak['flops_per_s'] / 1e9)} GFLOP/s and "
     f"{number(peak['bytes_per_s'] / 1e9)} GB/s; medians of {report['repeats']} (lowest "
     "to highest)."
   )
+
+
+def _versions(report: Report) -> str:
+  return ", ".join(f"{name} {x}" for name, x in report["versions"].items())
 
 
 def _parts(report: Report) -> list[str]:

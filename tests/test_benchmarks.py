@@ -184,6 +184,13 @@ def test_what_differs_after_a_resume_is_told_by_how_much():
     resume.compare(a, {"x": a["x"], "k": a["k"]})
 
 
+def test_the_document_is_what_the_stored_reports_make(tmp_path):
+  doc = tmp_path / "performance.md"
+  doc.write_text(tables.PERFORMANCE.read_text())
+  report.write(docs=doc)
+  assert doc.read_text() == tables.PERFORMANCE.read_text()
+
+
 def test_the_document_is_made_of_what_is_at_hand(tmp_path):
   doc = tmp_path / "performance.md"
   marks = [

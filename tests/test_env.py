@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from apnpql_jax import replay
+from apnpql_jax import evaluate, replay
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config import AgentConfig, EnvConfig
 from apnpql_jax.env import Env, make_env
@@ -130,6 +130,20 @@ def test_evaluation_is_repeatable(env, play):
   same = jax.tree.map(np.array_equal, first, again)
   assert all(jax.tree.leaves(same))
   assert not np.array_equal(first.length, other.length)
+
+
+def test_many_episodes_are_played_in_turns_each_row_once_before_any_is_repeated(
+  env, play, monkeypatch
+):
+  monkeypatch.setattr(evaluate, "MAX_WORLDS", 16)
+  played = play_held_out(env, play, 0.0, episodes=93, seed=5)  # The last turn is short.
+  assert len(played.success) == len(played.length) == 93
+  rows = (env.bank_split + np.arange(env.held_out)).reshape(-1, 16)
+  in_order = [play(0.0, jnp.asarray(turn), jax.random.key(9)) for turn in rows]
+  for field in ("success", "length"):
+    each = np.concatenate([getattr(episodes, field) for episodes in in_order])
+    found = getattr(played, field)[: env.held_out]
+    np.testing.assert_array_equal(np.sort(found), np.sort(each))
 
 
 def test_an_episode_is_what_steps_from_a_reset_make(env, play):

@@ -6,6 +6,7 @@ import json
 
 import gpu_sections
 import gpu_suite
+import pytest
 
 from apnpql_jax.tasks import task_names
 
@@ -32,6 +33,20 @@ def test_figures_are_in_the_report(tmp_path):
   assert found["product float32"]["compile_s"] > 0
   lines = list(gpu_suite.rows({"sections": {"device": section}}))
   assert [line[1] for line in lines] == list(found)
+
+
+@pytest.mark.slow
+def test_every_section_comes_to_its_end_on_a_cpu(tmp_path):
+  sections = run(tmp_path, "--budget", "1500", "--train", "5")
+  assert set(gpu_suite.SECTIONS) < set(sections)
+  for name in gpu_suite.SECTIONS:
+    assert sections[name]["status"] == "done" and not sections[name]["missing"], name
+  failed = [
+    line[1] for line in gpu_suite.rows({"sections": sections}) if "Error" in line[-1]
+  ]
+  assert set(failed) <= {"warp"}  # It may not be installed.
+  period = sections["engines"]["results"][0]
+  assert period["finite"] and period["qpos_differs"] < 1e-4
 
 
 def test_what_does_not_fit_into_the_budget_is_named(tmp_path):

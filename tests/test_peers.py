@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 from cures import cures
 import jax
 import mujoco
@@ -9,7 +11,9 @@ from mujoco.mjx._src import scan, solver
 import numpy as np
 import peer_mujoco
 from peer_worlds import World
+import peers
 import pytest
+import sections
 import sides
 import urdf
 
@@ -130,6 +134,20 @@ def test_a_side_that_cannot_start_or_is_late_is_left_out():
     sides.Side("peer_nothing.py", SIZES, limit_s=60)
   with pytest.raises(sides.SideFailed, match="no answer within 0 s"):
     sides.Side("peer_mujoco.py", SIZES, limit_s=0.05)
+
+
+@pytest.mark.slow
+def test_ratios_are_reported_or_why_there_are_none(capsys):
+  peers.main(["--quick", "--json", "--peers", "mujoco", "brax"])
+  report = json.loads(capsys.readouterr().out)
+  physics = next(
+    r for r in report["results"] if r.get("rate") == peers.RATES["physics"]
+  )
+  (ours,), (theirs,) = physics["ours_per_s"], physics["theirs_per_s"]
+  assert physics["ratio"] == pytest.approx(ours / theirs) and ours > 0
+  for result in report["results"]:
+    assert ("missing" in result) != ("ratio" in result)
+  assert physics["peer"] in sections.peers(report)
 
 
 @pytest.fixture(scope="module")
