@@ -19,7 +19,6 @@ from typing import Any
 import timing  # isort: skip  (before JAX: sets threads and cache)
 import floor
 import jax
-import modules
 import parts
 import settings
 
@@ -72,7 +71,7 @@ def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
   state = iterations.carry
   period = parts.measure(env, agent, state.learner.params, state.env, repeats=repeats)
   found = {name: part.times(length) for name, part in period.items()}
-  found["learning"], by_module = learn(config, agent, state, repeats)
+  found["learning"] = learn(config, agent, state, repeats)
   floor_s = sum(part.floor_s for part in found.values())
   return {
     "rollout_length": length,
@@ -83,18 +82,13 @@ def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
     "compile_s": compile_s,
     **floor.compare(floor_s, times.seconds),
     "parts": parts.shares(times.seconds, found),
-    "modules": by_module,
   }
 
 
 def learn(
   config: TrainConfig, agent: Agent, state: TrainState, repeats: int
-) -> tuple[parts.Part, dict[str, float]]:
-  """The updates of an iteration by themselves: batches are drawn and learnt from.
-
-  Returns:
-    the part of the iteration, and its share of each module, see ``modules.shares``.
-  """
+) -> parts.Part:
+  """The updates of an iteration by themselves: batches are drawn and learnt from."""
   sample = make_sample(config, agent)
   key = jax.random.key(0)
 
@@ -111,8 +105,7 @@ def learn(
   times = timing.measure(carried, repeats=repeats)
   batch = jax.eval_shape(sample, *rings, key)
   work = floor.count(agent.update, state.learner, batch, key).times(count)
-  by_module = modules.shares(run, carried)
-  return parts.Part(times.seconds, work.seconds()), by_module
+  return parts.Part(times.seconds, work.seconds())
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ import sys
 
 from matplotlib.figure import Figure
 import sections
+import summaries
 import tables
 
 SECTIONS: dict[str, Callable[[sections.Report], str]] = {
@@ -73,8 +74,9 @@ def write(results: Path = tables.RESULTS, docs: Path = tables.PERFORMANCE) -> No
   }
   for name, report in found.items():
     tables.put(name, SECTIONS[name](report), docs)
-  if found.keys() >= set(sections.COST_REPORTS):
-    tables.put("costs", sections.costs(found), docs)
+  for name, (summary, needed) in summaries.SUMMARIES.items():
+    if found.keys() >= needed:
+      tables.put(name, summary(found), docs)
   images = docs.parent / "images"
   images.mkdir(exist_ok=True)
   if "growth" in found:

@@ -18,9 +18,6 @@ RENDERERS = {
   "mujoco_osmesa": "MuJoCo, OSMesa",
   "pybullet_tiny": "PyBullet, TinyRenderer",
 }
-COST_REPORTS = ("learner", "encoder_layouts", "peers", "ray_layouts")
-"""Of which ``costs`` is made."""
-
 SETTING = ("task", "backend", "obs", "worlds")
 SIZES = {
   "worlds": "worlds",
@@ -163,16 +160,13 @@ def env_steps(report: Report) -> str:
 def end_to_end(report: Report) -> str:
   """Steps and updates per second of training."""
   parts = _parts(report)
-  modules = report["results"][0]["modules"]
-  within = [f"of learning: {name}" for name in modules]
-  head = (*SETTING, "steps/s", "limit", "reached", "updates/s", *parts, *within)
+  head = (*SETTING, "steps/s", "limit", "reached", "updates/s", *parts)
   rows = [
     (
       *(result[name] for name in SETTING),
       *rate(result, "steps"),
       spread(result, "updates_per_s"),
       *(_part(result["parts"].get(part)) for part in parts),
-      *(percent(result["modules"].get(name, 0.0)) for name in modules),
     )
     for result in report["results"]
   ]
@@ -224,54 +218,6 @@ def growth(report: Report) -> str:
         rows.setdefault(point["size"], [point["size"]]).extend(_point(last, point))
     tables.append(table(head, rows.values()))
   return "\n\n".join([note(report), "![growth](images/growth.png)", *tables])
-
-
-def costs(reports: dict[str, Report]) -> str:
-  """What was done about the largest costs, of the reports of ``COST_REPORTS``."""
-
-  def find(name: str, **setting: Any) -> dict[str, Any]:
-    results = reports[name]["results"]
-    return next(result for result in results if setting.items() <= result.items())
-
-  def row(
-    name: str, cost: str, before: dict[str, Any], after: dict[str, Any], cure: str
-  ) -> tuple[Any, ...]:
-    unit = "pairs" if name == "ray_layouts" else "updates"
-    slow, fast = (find(name, **x)[f"{unit}_per_s"] for x in (before, after))
-    figures = (f"{number(slow)} {unit}/s", number(fast), fast / slow)
-    return (cost, *figures, cure, f"`{name}.py`")
-
-  head = ("cost", "before", "after", "times", "what does it", "benchmark")
-  update = {"batch": 64, "candidates": 120}
-  stock = next(r for r in reports["peers"]["results"] if "mujoco.mjx" in r["peer"])
-  rows = [
-    row(
-      "learner",
-      "values of 120 candidates, batch 64",
-      update | {"phi": "repeated"},
-      update | {"phi": "once"},
-      "phi once per observation, first layer split",
-    ),
-    row(
-      "encoder_layouts",
-      "images in an update, batch 64",
-      {"layout": "4x4 / 4, 2x2 / 2 by XLA"},
-      {"layout": "4x4 / 4, 2x2 / 2"},
-      "convolutions as products of matrices",
-    ),
-    (
-      *("physics by MJX, 16 worlds", "", "", stock["ratio"]),
-      *("a barrier behind each body, cones in blocks", "`peers.py`"),
-    ),
-    row(
-      "ray_layouts",
-      "both cameras, 32 worlds",
-      {"layout": "fold, 1 block", "batch": 32},
-      {"layout": "fold, 4 blocks", "batch": 32},
-      "four blocks of pixels instead of one",
-    ),
-  ]
-  return table(head, rows)
 
 
 def peers(report: Report) -> str:
