@@ -119,9 +119,12 @@ def plot_rates(rates: sections.Rates, out: Path) -> None:
     for label, points in kinds.items():
       worlds, steps = zip(*sorted(points.items()), strict=True)
       panel.loglog(worlds, steps, "o-", label=label)
+    panel.set_xticks(worlds, labels=map(str, worlds), minor=False)
+    panel.set_xticks([], minor=True)
     panel.set(title=backend, xlabel="worlds")
   panels[0].set_ylabel("environment steps/s")
-  panels[0].legend()
+  lines = panels[0].get_legend_handles_labels()
+  figure.legend(*lines, loc="outside upper center", ncols=3)
   figure.savefig(out, dpi=120)
 
 
