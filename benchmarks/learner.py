@@ -113,8 +113,8 @@ def measure(
 def nth_update(agent: Agent, transitions: Transition, index: Any, state: Any) -> Any:
   """The state after one more update, for a loop.
 
-  Each has the transitions in another order: what depends on nothing but a batch that
-  stays, such as turning its images from bytes to numbers, XLA takes out of the loop.
+  Each has the transitions in another order. Otherwise XLA would take out of the loop
+  what depends on the batch alone, such as turning its images from bytes to numbers.
   """
   batch = jax.tree.map(lambda x: jnp.roll(x, index, axis=0), transitions)
   key = jax.random.fold_in(jax.random.key(0), index)

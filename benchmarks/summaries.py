@@ -71,7 +71,7 @@ def costs(reports: Reports) -> str:
     (
       *("physics by MJX, 16 worlds", "", ""),
       _ratio(reports, "mujoco.mjx"),
-      *("a barrier behind each body, cones in blocks", "`peers.py`"),
+      *("a barrier behind each body, cones in blocks, sums by XLA", "`peers.py`"),
     ),
     row(
       "ray_layouts",

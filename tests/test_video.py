@@ -60,10 +60,7 @@ def test_written_video_shows_the_frames(tmp_path):
   assert iio.immeta(path, plugin="FFMPEG")["fps"] == 5
 
 
-def test_ffmpeg_is_started_without_running_python_in_a_fork(
-  tmp_path, monkeypatch, recwarn
-):
-  monkeypatch.delenv("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", raising=False)
+def test_ffmpeg_is_started_without_running_python_in_a_fork(tmp_path, recwarn):
   jax.block_until_ready(jax.numpy.ones(1))  # From here on JAX warns of one.
   video.write_video(tmp_path / "episode.mp4", _frames(2, 24, 36), fps=5)
   assert not recwarn.list
