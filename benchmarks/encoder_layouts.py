@@ -20,7 +20,6 @@ from unittest import mock
 
 import timing  # isort: skip  (before JAX: sets threads and cache)
 from flax import linen as nn
-import floor
 import jax.numpy as jnp
 import learner
 import tables
@@ -53,20 +52,18 @@ def main() -> None:
 def measure_all(
   config: AgentConfig, args: argparse.Namespace
 ) -> Iterator[dict[str, Any]]:
-  """Figures of every layout, one after the other."""
+  """Figures of every layout, timed in turns."""
+  ready = []
   for name in args.layouts:
     layout = LAYOUTS[name]
     transitions = random_batch(0, args.batch, pixels=layout.pixels)
     agent = make_agent(dataclasses.replace(config, **layout.settings))
     parts: dict[str, Any] = {"PATCH": encoder.PATCH} | layout.parts
     with mock.patch.multiple(encoder, **parts):
-      times, compile_s, floor_s = learner.measure(agent, transitions, args.repeats)
-    yield {
-      "layout": name,
-      **times.rate("update"),
-      "compile_s": compile_s,
-      **floor.compare(floor_s, times.seconds),
-    }
+      ready.append(learner.prepare(agent, transitions))
+  measured = timing.measure(ready, repeats=args.repeats)
+  for name, updates, times in zip(args.layouts, ready, measured, strict=True):
+    yield {"layout": name, **updates.figures("update", times)}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,6 +19,7 @@ from typing import Any
 import timing  # isort: skip  (before JAX: sets threads and cache)
 import floor
 import jax
+import jax.numpy as jnp
 import parts
 import settings
 
@@ -66,28 +67,34 @@ def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
   updates = config.updates_per_iteration
   state = initial_state(config, env, agent, empty_expert)
   run, compile_s = timing.compiled(make_iteration(config, env, agent), state)
-  iterations = timing.Carried(run, state)
-  times = timing.measure(iterations, repeats=repeats)
-  state = iterations.carry
-  period = parts.measure(env, agent, state.learner.params, state.env, repeats=repeats)
-  found = {name: part.times(length) for name, part in period.items()}
-  found["learning"] = learn(config, agent, state, repeats)
-  floor_s = sum(part.floor_s for part in found.values())
+  state, _ = run(state)
+  period = parts.prepare(env, agent, state.learner.params, state.env)
+  learning = learn(config, agent, state)
+  # A copy, for an iteration takes the place of its state.
+  iteration = timing.Carried(run, jax.tree.map(jnp.copy, state))
+  floor_s = length * sum(part.floor_s for part in period.values()) + learning.floor_s
+  ready = {"iteration": timing.Ready(iteration, floor_s), "learning": learning} | period
+  measured = timing.measure(list(ready.values()), repeats=repeats)
+  times = dict(zip(ready, measured, strict=True))
+  whole = times["iteration"]
+  found = {
+    name: parts.Part(length * times[name].seconds, length * part.floor_s)
+    for name, part in period.items()
+  }
+  found["learning"] = parts.Part(times["learning"].seconds, learning.floor_s)
   return {
     "rollout_length": length,
     "updates_per_iteration": updates,
     "batch": config.replay.batch_size,
-    **times.per(worlds * length).rate("step"),
-    **times.per(updates).rate("update"),
+    **whole.per(worlds * length).rate("step"),
+    **whole.per(updates).rate("update"),
     "compile_s": compile_s,
-    **floor.compare(floor_s, times.seconds),
-    "parts": parts.shares(times.seconds, found),
+    **floor.compare(floor_s, whole.seconds),
+    "parts": parts.shares(whole.seconds, found),
   }
 
 
-def learn(
-  config: TrainConfig, agent: Agent, state: TrainState, repeats: int
-) -> parts.Part:
+def learn(config: TrainConfig, agent: Agent, state: TrainState) -> timing.Ready:
   """The updates of an iteration by themselves: batches are drawn and learnt from."""
   sample = make_sample(config, agent)
   key = jax.random.key(0)
@@ -102,10 +109,9 @@ def learn(
   rings = (state.replay, state.expert_replay)
   run, _ = timing.compiled(jax.jit(updates), state.learner, *rings)
   carried = timing.Carried(lambda learner: run(learner, *rings), state.learner)
-  times = timing.measure(carried, repeats=repeats)
   batch = jax.eval_shape(sample, *rings, key)
   work = floor.count(agent.update, state.learner, batch, key).times(count)
-  return parts.Part(times.seconds, work.seconds())
+  return timing.Ready(carried, work.seconds())
 
 
 if __name__ == "__main__":

@@ -17,7 +17,6 @@ import sys
 from typing import Any
 
 import timing  # isort: skip  (before JAX: sets threads and cache)
-import floor
 import jax
 import jax.numpy as jnp
 import parts
@@ -28,6 +27,9 @@ from apnpql_jax.config import ConfigError, TrainConfig
 from apnpql_jax.env import Env, make_env
 from apnpql_jax.env_state import EnvState
 from apnpql_jax.rollout import Policy, agent_policy, rollout
+
+PLAYED = 5
+"""Rollouts of each policy before anything is timed."""
 
 
 def main() -> None:
@@ -58,23 +60,34 @@ def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
     "env": lambda params: parts.random_policy,
     "env_policy": functools.partial(agent_policy, agent, greedy=False),
   }
-  played = {}
+  players = {}
   for name, policy in policies.items():
-    run, compile_s = player(env, policy, params, state, length=length)
-    times = timing.measure(run, repeats=repeats).per(length * worlds)
-    played[name], (state, _) = (times, compile_s), run.carry
+    players[name] = player(env, policy, params, state, length=length)
+    run, _ = players[name]
+    for _ in range(PLAYED):
+      run()
+    state, _ = run.carry
   # From where the policy has come to: at the reset nothing moves yet.
-  found = parts.measure(env, agent, params, state, repeats=repeats)
-  figures: dict[str, Any] = {}
-  for name, (times, compile_s) in played.items():
-    idle = "networks" if name == "env" else None
-    floor_s = sum(part.floor_s for key, part in found.items() if key != idle)
-    figures[name] = {
-      **times.rate("step"),
-      "compile_s": compile_s,
-      **floor.compare(floor_s / worlds, times.seconds),
-    }
-  period_s = worlds / figures["env_policy"]["steps_per_s"]
+  period = parts.prepare(env, agent, params, state)
+  floors = {name: part.floor_s / worlds for name, part in period.items()}
+  whole = {
+    "env": sum(floors.values()) - floors["networks"],
+    "env_policy": sum(floors.values()),
+  }
+  rollouts = {
+    name: timing.Ready(run, whole[name], length * worlds, compile_s)
+    for name, (run, compile_s) in players.items()
+  }
+  ready = rollouts | period
+  measured = timing.measure(list(ready.values()), repeats=repeats)
+  times = dict(zip(ready, measured, strict=True))
+  figures: dict[str, Any] = {
+    name: run.figures("step", times[name]) for name, run in rollouts.items()
+  }
+  found = {
+    name: parts.Part(times[name].seconds, part.floor_s) for name, part in period.items()
+  }
+  period_s = worlds * times["env_policy"].seconds
   return figures | {"parts": parts.shares(period_s, found)}
 
 

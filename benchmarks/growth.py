@@ -53,11 +53,8 @@ WORLDS = 32
 PLAYED = 16
 """Periods after the reset at which worlds are timed, however many there are."""
 
-Timed = tuple[timing.Times, float]
-"""Of one call, and the least seconds that it can take."""
-
-Sizes = Iterator[tuple[str, int, Callable[..., Timed]]]
-"""Series, size, and what times it, given ``repeats``."""
+Sizes = Iterator[tuple[str, int, Callable[[], timing.Ready]]]
+"""Series, size, and what prepares it."""
 
 
 def main() -> None:
@@ -79,16 +76,20 @@ def main() -> None:
 
 
 def measure_all(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-  """Figures of every size along every axis."""
+  """Figures of every size along every axis, those of an axis timed in turns."""
   config = settings.tiny_pixels() if args.quick else load_preset("push_plate")
   for axis in args.axes:
-    for series, size, point in AXES[axis](config, args):
+    points, ready = [], []
+    for series, size, prepare in AXES[axis](config, args):
       try:
-        times, floor_s = point(repeats=args.repeats)
+        ready.append(prepare())
       except ConfigError as error:  # The memory does not suffice.
         print(f"{axis} {series} {size}: {error}", file=sys.stderr)
         continue
-      figures = timing.spread(times.wall) | floor.compare(floor_s, times.seconds)
+      points.append((series, size))
+    measured = timing.measure(ready, repeats=args.repeats)
+    for (series, size), run, times in zip(points, ready, measured, strict=True):
+      figures = timing.spread(times.wall) | floor.compare(run.floor_s, times.seconds)
       yield {"axis": axis, "series": series, "size": size, **figures}
 
 
@@ -146,19 +147,18 @@ AXES = {
 }
 
 
-def _period(config: EnvConfig, *, repeats: int) -> Timed:
+def _period(config: EnvConfig) -> timing.Ready:
   env = make_env(config)
   state = env.reset(jnp.arange(config.worlds) % env.bank_split)
   run, _ = env_steps.player(env, lambda _: parts.random_policy, None, state, length=1)
   for _ in range(PLAYED):
     run()
-  times = timing.measure(run.again, repeats=repeats)
   images = floor.count(functools.partial(parts.draw, env, config), state.physics)
   physics = parts.physics_work(env.physics, state.physics)
-  return times, images.seconds() + physics.seconds()
+  return timing.Ready(run.again, images.seconds() + physics.seconds())
 
 
-def _update(config: AgentConfig, env: EnvConfig, *, repeats: int) -> Timed:
+def _update(config: AgentConfig, env: EnvConfig) -> timing.Ready:
   rng = np.random.default_rng(0)
 
   def look(seen: Observation) -> Observation:
@@ -175,20 +175,19 @@ def _update(config: AgentConfig, env: EnvConfig, *, repeats: int) -> Timed:
   batch = batch.replace(
     observation_tm1=look(batch.observation_tm1), observation_t=look(batch.observation_t)
   )
-  times, _, floor_s = learner.measure(make_agent(config), batch, repeats)
-  return times, floor_s
+  return learner.prepare(make_agent(config), batch)
 
 
-def _images(config: EnvConfig, *, repeats: int) -> Timed:
+def _images(config: EnvConfig) -> timing.Ready:
   env = make_env(dataclasses.replace(config, obs="state"))
   state = env.reset(jnp.arange(config.worlds)).physics
   draw = functools.partial(parts.draw, env, config)
   run, _ = timing.compiled(jax.jit(draw), state)
-  times = timing.measure(lambda: run(state), repeats=repeats)
-  return times, floor.count(draw, state).seconds()
+  floor_s = floor.count(draw, state).seconds()
+  return timing.Ready(functools.partial(run, state), floor_s)
 
 
-def _replay(config: TrainConfig, count: int, *, repeats: int) -> Timed:
+def _replay(config: TrainConfig, count: int) -> timing.Ready:
   env = make_env(config.env)
   seen = jax.eval_shape(env.reset, jnp.zeros(config.env.worlds, jnp.int32))
   create = functools.partial(
@@ -218,10 +217,9 @@ def _replay(config: TrainConfig, count: int, *, repeats: int) -> Timed:
   jitted = jax.jit(step, donate_argnums=0)
   run, _ = timing.compiled(jitted, carry, chunk)
   go_on = timing.Carried(lambda carry: run(carry, chunk), carry)
-  times = timing.measure(go_on, repeats=repeats)
   # Each is read here and written there.
   moved = floor.nbytes((chunk, jax.eval_shape(step, carry, chunk)[1]))
-  return times, floor.Work(0.0, 2 * moved).seconds()
+  return timing.Ready(go_on, floor.Work(0.0, 2 * moved).seconds())
 
 
 def _keep_pairs(count: int, spec: mujoco.MjSpec) -> None:
@@ -230,14 +228,14 @@ def _keep_pairs(count: int, spec: mujoco.MjSpec) -> None:
     spec.delete(pair)
 
 
-def _physics(scene: Scene, backend: str, *, repeats: int) -> Timed:
+def _physics(scene: Scene, backend: str) -> timing.Ready:
   draw = make_task(scene.name).sample_resets(np.random.default_rng(0), WORLDS)
   state = initial_state(scene, *map(jnp.asarray, draw))
   engine = make_physics(backend, scene, substeps=SUBSTEPS)
   inputs = (state, jnp.zeros((WORLDS, 6)), jnp.zeros(WORLDS))
   run, _ = timing.compiled(jax.jit(engine.step), *inputs)
-  times = timing.measure(functools.partial(run, *inputs), repeats=repeats)
-  return times, parts.physics_work(engine, state).seconds()
+  floor_s = parts.physics_work(engine, state).seconds()
+  return timing.Ready(functools.partial(run, *inputs), floor_s)
 
 
 if __name__ == "__main__":

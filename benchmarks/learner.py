@@ -60,19 +60,19 @@ def main() -> None:
 def measure_all(
   config: AgentConfig, args: argparse.Namespace
 ) -> Iterator[dict[str, Any]]:
-  """Figures of every setting, one after the other."""
+  """Figures of every setting, both ways of phi timed in turns."""
   for batch, candidates in itertools.product(args.batch, args.candidates):
     transitions = random_batch(0, batch, pixels=True, instants=config.lstm_instants)
-    for phi, build in (("once", make_agent), ("repeated", forgetful_agent)):
-      agent = build(with_candidates(config, candidates))
-      times, compile_s, floor_s = measure(agent, transitions, args.repeats)
+    chosen = with_candidates(config, candidates)
+    ways = {"once": make_agent, "repeated": forgetful_agent}
+    ready = [prepare(build(chosen), transitions) for build in ways.values()]
+    measured = timing.measure(ready, repeats=args.repeats)
+    for phi, updates, times in zip(ways, ready, measured, strict=True):
       yield {
         "batch": batch,
         "candidates": candidates,
         "phi": phi,
-        **times.rate("update"),
-        "compile_s": compile_s,
-        **floor.compare(floor_s, times.seconds),
+        **updates.figures("update", times),
       }
 
 
@@ -85,14 +85,8 @@ def with_candidates(config: AgentConfig, count: int) -> AgentConfig:
   )
 
 
-def measure(
-  agent: Agent, transitions: Transition, repeats: int
-) -> tuple[timing.Times, float, float]:
-  """Times updates in a loop, where training has them.
-
-  Returns:
-    times of one update, seconds of compilation, the least seconds of an update.
-  """
+def prepare(agent: Agent, transitions: Transition) -> timing.Ready:
+  """Updates in a loop, where training has them, as many as fill a repeat."""
   key = jax.random.key(0)
   state = jax.jit(agent.init)(key, transitions.observation_tm1)
 
@@ -103,11 +97,11 @@ def measure(
 
   run, compile_s = timing.compiled(updates, state, transitions, 1)
   run = functools.partial(run, state, transitions)
-  once = timing.measure(lambda: run(1), repeats=1, seconds=0.0)
+  floor_s = floor.count(agent.update, state, transitions, key).seconds()
+  one = timing.Ready(functools.partial(run, 1), floor_s)
+  (once,) = timing.measure([one], repeats=1, seconds=0.0)
   count = math.ceil(timing.SECONDS / once.seconds)
-  times = timing.measure(lambda: run(count), repeats=repeats, seconds=0.0)
-  work = floor.count(agent.update, state, transitions, key)
-  return times.per(count), compile_s, work.seconds()
+  return timing.Ready(functools.partial(run, count), floor_s, count, compile_s)
 
 
 def nth_update(agent: Agent, transitions: Transition, index: Any, state: Any) -> Any:

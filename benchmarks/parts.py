@@ -39,10 +39,6 @@ class Part(NamedTuple):
   seconds: float  # measured
   floor_s: float  # the least possible
 
-  def times(self, count: float) -> Part:
-    """The same, ``count`` times."""
-    return Part(count * self.seconds, count * self.floor_s)
-
 
 def random_policy(state: EnvState, key: Array) -> tuple[Array, Array]:
   """Random actions as a ``rollout.Policy``."""
@@ -63,35 +59,32 @@ def draw(env: Env, config: EnvConfig, physics: PhysicsState) -> list[Array]:
   return [env.view(camera, physics) for camera in make_cameras(config, env.task.scene)]
 
 
-def measure(
-  env: Env, agent: Agent, params: Any, state: EnvState, *, repeats: int
-) -> dict[str, Part]:
-  """Times the parts of a period from the instant ``state``."""
+def prepare(
+  env: Env, agent: Agent, params: Any, state: EnvState
+) -> dict[str, timing.Ready]:
+  """The parts of a period from the instant ``state``, of all worlds."""
   action = random_actions(jax.random.key(0), state.elapsed.shape[0])
   velocity, close = action[:, :ARM_DOF], action[:, ARM_DOF]
   moving = (state.physics, velocity, close)
   work = physics_work(env.physics, state.physics)
-  found = {"physics": _timed(env.physics.step, moving, repeats, work)}
+  found = {"physics": _ready(env.physics.step, moving, work)}
   if env.config.obs == "pixels":
     images = functools.partial(draw, env, env.config)
-    found["rendering"] = _timed(images, (state.physics,), repeats)
+    found["rendering"] = _ready(images, (state.physics,))
 
   def act(params: Any, state: EnvState, key: Array) -> tuple[Array, Array]:
     return agent_policy(agent, params, greedy=False)(state, key)
 
   looking = (params, state, jax.random.key(0))
-  return found | {"networks": _timed(act, looking, repeats)}
+  return found | {"networks": _ready(act, looking)}
 
 
-def _timed(
-  function: Callable[..., Any],
-  args: tuple[Any, ...],
-  repeats: int,
-  work: floor.Work | None = None,
-) -> Part:
+def _ready(
+  function: Callable[..., Any], args: tuple[Any, ...], work: floor.Work | None = None
+) -> timing.Ready:
   run, _ = timing.compiled(jax.jit(function), *args)
-  times = timing.measure(functools.partial(run, *args), repeats=repeats)
-  return Part(times.seconds, (work or floor.count(function, *args)).seconds())
+  floor_s = (work or floor.count(function, *args)).seconds()
+  return timing.Ready(functools.partial(run, *args), floor_s)
 
 
 def shares(whole_s: float, parts: dict[str, Part]) -> dict[str, dict[str, float]]:

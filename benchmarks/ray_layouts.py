@@ -50,26 +50,28 @@ def main() -> None:
 
 
 def measure_all(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-  """Figures of every layout and batch, one after the other."""
+  """Figures of every batch, its layouts timed in turns."""
   scene = load_scene(mjcf_path(SCENE))
   for batch in args.batch:
     poses = make_poses(scene, batch)
     plain = make_pair(scene, SIZES)
-    floor_s, expected = floor.count(plain, poses).seconds(), jax.jit(plain)(poses)
+    expected, ready = jax.jit(plain)(poses), []
+    floor_s = floor.count(plain, poses).seconds() / batch
     for name in args.layouts:
       layout = LAYOUTS[name]
       with layout.traced():
         pair = jax.jit(layout.pair(scene))
         run, compile_s = timing.compiled(pair, poses, options=layout.options)
-      times = timing.measure(functools.partial(run, poses), repeats=args.repeats)
-      drawn = zip(run(poses), expected, strict=True)
+      run = functools.partial(run, poses)
+      ready.append(timing.Ready(run, floor_s, batch, compile_s))
+    measured = timing.measure(ready, repeats=args.repeats)
+    for name, pairs, times in zip(args.layouts, ready, measured, strict=True):
+      drawn = zip(pairs.run(), expected, strict=True)
       same = [(images == others).all(-1).ravel() for images, others in drawn]
       yield {
         "layout": name,
         "batch": batch,
-        **times.per(batch).rate("pair"),
-        "compile_s": compile_s,
-        **floor.compare(floor_s, times.seconds),
+        **pairs.figures("pair", times),
         "agreeing": float(jnp.concatenate(same).mean()),
       }
 

@@ -61,7 +61,7 @@ def main() -> None:
 def measure_all(
   scene: Scene, resolutions: dict[str, Any], args: argparse.Namespace
 ) -> Iterator[dict[str, Any]]:
-  """Figures of every renderer and size, one after the other."""
+  """Figures of every size: of other renderers, then of ours, its batches in turns."""
   for name, sizes in resolutions.items():
     others = {}
     if not args.alone:
@@ -69,19 +69,22 @@ def measure_all(
     for renderer, found in others.items():
       yield {"resolution": name, "renderer": renderer, **found}
     plain = itertools.product([False], args.batch)
-    for shadow, batch in [*plain, *itertools.product([True], args.shadow)]:
+    rows, ready = [*plain, *itertools.product([True], args.shadow)], []
+    for shadow, batch in rows:
       pair, poses = make_pair(scene, sizes, shadow=shadow), make_poses(scene, batch)
       run, compile_s = timing.compiled(jax.jit(pair), poses)
-      times = timing.measure(functools.partial(run, poses), repeats=args.repeats)
-      floor_s = floor.count(pair, poses).seconds()
+      floor_s = floor.count(pair, poses).seconds() / batch
+      ready.append(
+        timing.Ready(functools.partial(run, poses), floor_s, batch, compile_s)
+      )
+    measured = timing.measure(ready, repeats=args.repeats)
+    for (shadow, batch), pairs, times in zip(rows, ready, measured, strict=True):
       yield {
         "resolution": name,
         "renderer": "ray_caster",
         "batch": batch,
         "shadow": shadow,
-        **times.per(batch).rate("pair"),
-        "compile_s": compile_s,
-        **floor.compare(floor_s / batch, times.per(batch).seconds),
+        **pairs.figures("pair", times),
       }
 
 

@@ -2,8 +2,9 @@
 
 Compilation is timed apart: it is what this process waited, which is little where the
 persistent cache holds the program (``compile_time.py`` empties it). A repeat runs until
-everything is ready, as often as fills ``SECONDS``. Figures are medians over repeats,
-with the lowest and the highest.
+everything is ready, as often as fills ``SECONDS``. What is compared is timed in turns,
+one repeat of each, so that a minute in which the machine is slow meets all of it.
+Figures are medians over repeats, with the lowest and the highest.
 """
 
 from __future__ import annotations
@@ -55,6 +56,30 @@ class Times:
     }
 
 
+@dataclasses.dataclass(frozen=True)
+class Ready:
+  """A run that is compiled and waits to be timed."""
+
+  run: Callable[[], Any]
+  """Returns all arrays that it computes."""
+
+  floor_s: float
+  """The least seconds of one of the things that it does."""
+
+  things: int = 1
+  """That it does, such as updates."""
+
+  compile_s: float = 0.0
+
+  def figures(self, name: str, times: Times) -> dict[str, float]:
+    """Things per second for the report; see ``measure``."""
+    return {
+      **times.rate(name),
+      "compile_s": self.compile_s,
+      **floor.compare(self.floor_s, times.seconds),
+    }
+
+
 def spread(seconds: Sequence[float]) -> dict[str, float]:
   """Seconds of all repeats for the report."""
   return {
@@ -103,19 +128,30 @@ def compiled(
   return program, seconds
 
 
-def measure(run: Callable[[], Any], *, repeats: int, seconds: float = SECONDS) -> Times:
-  """Times a run that is compiled.
+def measure(
+  ready: Sequence[Ready], *, repeats: int, seconds: float = SECONDS
+) -> list[Times]:
+  """Times runs in turns.
 
   Args:
-    run: returns all arrays that it computes.
-    repeats: how often it is timed, after two calls that are not.
+    ready: the runs.
+    repeats: how often each is timed, after two calls that are not.
     seconds: least time of a repeat.
+
+  Returns:
+    for each run the times of one of the things that it does.
   """
-  _time(run, 1)
-  calls = max(1, math.ceil(seconds / _time(run, 1)[0]))
-  pairs = [_time(run, calls) for _ in range(repeats)]
-  wall, cpu = zip(*pairs, strict=True)
-  return Times(wall, cpu).per(calls)
+  calls = []
+  for each in ready:
+    _time(each.run, 1)
+    calls.append(max(1, math.ceil(seconds / _time(each.run, 1)[0])))
+  rounds = [
+    list(map(_time, (each.run for each in ready), calls)) for _ in range(repeats)
+  ]
+  return [
+    Times(*zip(*pairs, strict=True)).per(count * each.things)
+    for each, count, pairs in zip(ready, calls, zip(*rounds, strict=True), strict=True)
+  ]
 
 
 def _time(run: Callable[[], Any], calls: int) -> tuple[float, float]:

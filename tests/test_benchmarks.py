@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import functools
+import itertools
 import json
 import os
 import subprocess
@@ -135,17 +137,29 @@ def test_the_floor_is_the_slower_of_computing_and_moving(monkeypatch):
   assert floor.Work(20.0, 500.0).seconds() == 5.0
 
 
-def test_times_are_of_one_call():
+def test_times_are_of_one_thing_and_runs_take_turns():
   calls = []
 
-  def nap() -> jax.Array:
-    calls.append(time.sleep(0.01))
+  def nap(name: str, seconds: float) -> jax.Array:
+    time.sleep(seconds)
+    calls.append(name)
     return jnp.zeros(())
 
-  times = timing.measure(nap, repeats=3, seconds=0.03)
-  assert len(times.wall) == 3 and len(calls) >= 8
-  assert 0.01 <= times.seconds < 0.03
-  assert times.per(10).seconds == pytest.approx(times.seconds / 10)
+  ready = [
+    timing.Ready(functools.partial(nap, "one", 0.01), floor_s=0.005),
+    timing.Ready(functools.partial(nap, "ten", 0.04), floor_s=0.001, things=10),
+  ]
+  one, ten = timing.measure(ready, repeats=3, seconds=0.03)
+  assert len(one.wall) == len(ten.wall) == 3
+  assert 0.01 <= one.seconds < 0.03
+  assert 0.004 <= ten.seconds < 0.012
+  assert one.per(10).seconds == pytest.approx(one.seconds / 10)
+  # Two calls of each that do not count, then three rounds.
+  turns = [name for name, _ in itertools.groupby(calls)]
+  assert turns == ["one", "ten"] * 4 and calls.count("ten") == 5
+  figures = ready[1].figures("step", ten)
+  assert figures["steps_per_s"] == pytest.approx(1 / ten.seconds)
+  assert figures["of_floor"] == pytest.approx(0.001 / ten.seconds)
 
 
 def test_shares_add_up_even_if_parts_are_slower_alone():
