@@ -37,7 +37,7 @@ from batches import random_batch  # noqa: E402  (the noise that the tests use)
 
 def main() -> None:
   """Command line; see the module's docstring."""
-  parser = timing.parser(__doc__)
+  parser = timing.parser(__doc__, repeats=15)
   parser.add_argument("--preset", default="push_plate")
   parser.add_argument("--batch", type=int, default=64)
   parser.add_argument("--layouts", nargs="+", choices=LAYOUTS, default=list(LAYOUTS))

@@ -67,7 +67,8 @@ def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
   updates = config.updates_per_iteration
   state = initial_state(config, env, agent, empty_expert)
   run, compile_s = timing.compiled(make_iteration(config, env, agent), state)
-  state, _ = run(state)
+  for _ in range(parts.PLAYED):
+    state, _ = run(state)
   period = parts.prepare(env, agent, state.learner.params, state.env)
   learning = learn(config, agent, state)
   # A copy, for an iteration takes the place of its state.

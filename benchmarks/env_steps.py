@@ -28,9 +28,6 @@ from apnpql_jax.env import Env, make_env
 from apnpql_jax.env_state import EnvState
 from apnpql_jax.rollout import Policy, agent_policy, rollout
 
-PLAYED = 5
-"""Rollouts of each policy before anything is timed."""
-
 
 def main() -> None:
   """Command line; see the module's docstring."""
@@ -64,10 +61,9 @@ def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
   for name, policy in policies.items():
     players[name] = player(env, policy, params, state, length=length)
     run, _ = players[name]
-    for _ in range(PLAYED):
+    for _ in range(parts.PLAYED):
       run()
     state, _ = run.carry
-  # From where the policy has come to: at the reset nothing moves yet.
   period = parts.prepare(env, agent, params, state)
   floors = {name: part.floor_s / worlds for name, part in period.items()}
   whole = {

@@ -29,6 +29,9 @@ from apnpql_jax.sim.mjx import MjxPhysics
 from apnpql_jax.sim.physics import Physics, PhysicsState
 from apnpql_jax.types import ARM_DOF, Array
 
+PLAYED = 5
+"""Rollouts before anything is timed: at the reset nothing moves yet."""
+
 _substep_flops: dict[tuple[str, bool], float] = {}
 """Of one world; by fingerprint of the scene, and whether contacts count."""
 

@@ -40,7 +40,7 @@ Cast = tuple[Array, Array]
 
 def main() -> None:
   """Command line; see the module's docstring."""
-  parser = timing.parser(__doc__)
+  parser = timing.parser(__doc__, repeats=15)
   parser.add_argument("--batch", type=int, nargs="+", default=[32, 256])
   parser.add_argument("--layouts", nargs="+", choices=LAYOUTS, default=list(LAYOUTS))
   args = timing.parse(parser)

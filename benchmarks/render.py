@@ -89,7 +89,7 @@ def measure_all(
 
 
 def _parser() -> argparse.ArgumentParser:
-  parser = timing.parser(__doc__)
+  parser = timing.parser(__doc__, repeats=15)
   parser.add_argument(
     "--alone", action="store_true", help="without the other renderers"
   )
