@@ -46,6 +46,8 @@ def main() -> None:
   args = timing.parse(parser)
   if args.quick:
     args.batch = [2]
+  # Seconds of compilation are compared, too.
+  jax.config.update("jax_enable_compilation_cache", False)
   timing.publish("ray_layouts", args, measure_all(args), scene=SCENE)
 
 

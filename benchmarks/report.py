@@ -11,13 +11,14 @@ a pair of marks in the document. Those whose report is missing stay as they are.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import json
 import math
 from pathlib import Path
 import subprocess
 import sys
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import sections
 import summaries
@@ -104,6 +105,7 @@ def plot_growth(report: sections.Report, out: Path) -> None:
       panel.loglog(sizes, in_proportion, "--", color=line.get_color(), linewidth=0.8)
       floors = [point["floor_s"] for point in points]
       panel.loglog(sizes, floors, ":", color=line.get_color(), linewidth=0.8)
+    _mark(panel, sizes)
     panel.set_xlabel(sections.SIZES[axis])
     panel.legend()
   for panel in panels[:, 0]:
@@ -119,13 +121,18 @@ def plot_rates(rates: sections.Rates, out: Path) -> None:
     for label, points in kinds.items():
       worlds, steps = zip(*sorted(points.items()), strict=True)
       panel.loglog(worlds, steps, "o-", label=label)
-    panel.set_xticks(worlds, labels=map(str, worlds), minor=False)
-    panel.set_xticks([], minor=True)
+    _mark(panel, worlds)
     panel.set(title=backend, xlabel="worlds")
   panels[0].set_ylabel("environment steps/s")
   lines = panels[0].get_legend_handles_labels()
   figure.legend(*lines, loc="outside upper center", ncols=3)
   figure.savefig(out, dpi=120)
+
+
+def _mark(panel: Axes, sizes: Sequence[int]) -> None:
+  """Marks nothing but these on the axis along which they grow."""
+  panel.set_xticks(sizes, labels=map(str, sizes), minor=False)
+  panel.set_xticks([], minor=True)
 
 
 if __name__ == "__main__":
