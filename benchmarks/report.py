@@ -131,7 +131,7 @@ def plot_rates(rates: sections.Rates, out: Path) -> None:
 
 def _mark(panel: Axes, sizes: Sequence[int]) -> None:
   """Marks nothing but these on the axis along which they grow."""
-  panel.set_xticks(sizes, labels=map(str, sizes), minor=False)
+  panel.set_xticks(sizes, labels=map(str, sizes), minor=False, fontsize="small")
   panel.set_xticks([], minor=True)
 
 
