@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from apnpql_jax.config import EnvConfig
+from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.render import CameraSpec, Geoms, Lighting, render
 from apnpql_jax.render.shadow import SHADOWS
 from apnpql_jax.sim.kinematics import Kinematics

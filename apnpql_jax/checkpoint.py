@@ -20,13 +20,9 @@ from apnpql_jax.checkpoint_record import (
   newest_until,
   title,
 )
-from apnpql_jax.config import (
-  ConfigError,
-  TrainConfig,
-  config_diff,
-  config_from_json,
-  format_diff,
-)
+from apnpql_jax.config.files import config_diff, config_from_json, format_diff
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.runs import MAY_CHANGE
 
 all_steps = checkpoint_record.steps

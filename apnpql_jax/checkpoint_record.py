@@ -15,7 +15,9 @@ from typing import Any, NamedTuple
 import zlib
 
 from apnpql_jax import leaves, runs
-from apnpql_jax.config import ConfigError, TrainConfig, config_to_json
+from apnpql_jax.config.files import config_to_json
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.errors import ConfigError
 
 SCHEMA_VERSION = 2
 """Raised whenever what the code expects in a checkpoint changes."""

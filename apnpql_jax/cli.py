@@ -12,9 +12,10 @@ import sys
 from typing import Any
 
 import apnpql_jax
-from apnpql_jax import commands, presets, runs
+from apnpql_jax import commands, errors
 from apnpql_jax.commands import Json
-from apnpql_jax.config import ConfigError, check_name
+from apnpql_jax.config import files
+from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.options import Collect, Convert, Evaluate, List, Repeat, Train, parse
 from apnpql_jax.signals import Signals
 
@@ -46,14 +47,14 @@ def main(argv: Sequence[str] | None = None) -> int:
   except ConfigError as error:
     _complain(" ".join(str(error).split()))
     return 2
-  except runs.RunStopped as stop:
+  except errors.RunStopped as stop:
     _complain(str(stop))
-    if stop.code == runs.FAILED:
+    if stop.code == errors.FAILED:
       # Threads of a save that failed half-way may wait for each other for minutes.
       os._exit(stop.code)
     return stop.code
   except KeyboardInterrupt:
-    return runs.INTERRUPTED + signal.SIGINT
+    return errors.INTERRUPTED + signal.SIGINT
   except BrokenPipeError:  # The reader of our output left, as `head` does.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     return 0
@@ -67,10 +68,10 @@ def _complain(line: str) -> None:
 
 def _preset_named(kind: type[Any], args: Sequence[str]) -> Train | None:
   """The defaults that ``train PRESET --help`` has to show."""
-  named = [arg for arg in args if arg in presets.preset_names()]
+  named = [arg for arg in args if arg in files.preset_names()]
   if kind is not Train or not named:
     return None
-  return Train(config=presets.load_preset(named[0]))
+  return Train(config=files.load_preset(named[0]))
 
 
 @contextlib.contextmanager

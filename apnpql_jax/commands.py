@@ -13,15 +13,11 @@ from pathlib import Path
 import sys
 from typing import TYPE_CHECKING, Any
 
-from apnpql_jax import presets, runs
-from apnpql_jax.config import (
-  BACKENDS,
-  ConfigError,
-  EnvConfig,
-  TrainConfig,
-  check_name,
-  validate,
-)
+from apnpql_jax import runs
+from apnpql_jax.config import files
+from apnpql_jax.config.checks import BACKENDS, validate
+from apnpql_jax.config.schema import EnvConfig, TrainConfig
+from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.options import Collect, Convert, Evaluate, List, Repeat, Train, parse
 
 if TYPE_CHECKING:
@@ -35,10 +31,10 @@ def train(args: Train, argv: Sequence[str]) -> Json:
   if args.resume is not None and (args.run is not None or args.overwrite):
     raise ConfigError("--resume names the run itself; leave out --run and --overwrite")
   if not args.preset and args.resume is None:
-    names = ", ".join(presets.preset_names())
+    names = ", ".join(files.preset_names())
     raise ConfigError(f"train needs a preset; choose from {names}")
   if args.preset:
-    base = presets.load_preset(args.preset)
+    base = files.load_preset(args.preset)
   else:
     base = runs.load_run_config(args.resume or Path(), _tell)
   # Parsed a second time, now on top of the settings asked for.
@@ -103,8 +99,8 @@ def collect(args: Collect, argv: Sequence[str]) -> Json:
 
   check_name("task", args.task, tasks.task_names())
   env = EnvConfig(task=args.task)
-  if args.task in presets.preset_names():
-    env = presets.load_preset(args.task).env
+  if args.task in files.preset_names():
+    env = files.load_preset(args.task).env
 
   from apnpql_jax.evaluate import evaluate_expert
 
@@ -130,8 +126,8 @@ def convert(args: Convert, argv: Sequence[str]) -> Json:
 
   check_name("task", args.task, tasks.task_names())
   period_s = EnvConfig().control_period_s
-  if args.task in presets.preset_names():
-    period_s = presets.load_preset(args.task).env.control_period_s
+  if args.task in files.preset_names():
+    period_s = files.load_preset(args.task).env.control_period_s
   scene = tasks.make_task(args.task).scene
   demos = recordings.convert(Path(args.recording), scene, period_s=period_s)
   return demonstrations.save(
@@ -165,7 +161,7 @@ def list_names(args: List, argv: Sequence[str]) -> Json:
     return {name: contact_report(tasks.make_task(name)) for name in names}
   return {
     "tasks": names,
-    "presets": presets.preset_names(),
+    "presets": files.preset_names(),
     "algorithms": list(algorithms.ALGORITHMS),
     "backends": list(BACKENDS),
   }

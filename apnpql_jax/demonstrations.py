@@ -16,9 +16,10 @@ import mujoco
 import numpy as np
 
 from apnpql_jax import memory, npz, replay
-from apnpql_jax.config import ConfigError, EnvConfig, TrainConfig
+from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.env import Env, make_env
 from apnpql_jax.env_state import EnvState
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.iteration import example_slot, place
 from apnpql_jax.primitives import ik
 from apnpql_jax.replay import Replay

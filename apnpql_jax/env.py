@@ -16,8 +16,9 @@ from jax.sharding import Mesh
 
 from apnpql_jax import sharding
 from apnpql_jax.cameras import Renderer, make_cameras
-from apnpql_jax.config import ConfigError, EnvConfig
+from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.env_state import Arrival, EnvState
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.primitives import tracking
 from apnpql_jax.primitives.bank import ResetBank, load_bank
 from apnpql_jax.randomization.worlds import make_randomize

@@ -15,7 +15,7 @@ import numpy as np
 
 from apnpql_jax import checkpoint, leaves, memory, run_folder
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import EnvConfig
+from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.env import Env, make_env
 from apnpql_jax.metrics import wilson_interval
 from apnpql_jax.recording import record_episodes

@@ -7,7 +7,7 @@ import importlib.util
 from pathlib import Path
 from typing import Any
 
-from apnpql_jax.config import ConfigError, check_name
+from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.metrics import Sink
 
 

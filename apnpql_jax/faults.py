@@ -14,9 +14,10 @@ from jax.experimental import multihost_utils
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax import leaves, npz, runs, sharding
+from apnpql_jax import errors, leaves, npz, runs, sharding
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import ConfigError, TrainConfig
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.iteration import TrainState, make_sample
 from apnpql_jax.run_folder import RunFolder
 from apnpql_jax.types import Observation, Slot, TimeStep, Transition
@@ -38,10 +39,10 @@ def check(config: TrainConfig, state: TrainState, folder: RunFolder) -> None:
   folder.faults.mkdir(exist_ok=True)
   path = folder.faults / f"step_{int(state.env_steps):08d}.npz"
   write(path, config, state)
-  raise runs.RunStopped(
+  raise errors.RunStopped(
     f"{skipped} updates in a row were not finite; repeat the last one with: "
     f"apnpql repeat {path}",
-    runs.FAILED,
+    errors.FAILED,
   )
 
 

@@ -19,7 +19,7 @@ from jax.sharding import (
 
 from apnpql_jax import replay
 from apnpql_jax.agents.learner import Agent, LearnerState
-from apnpql_jax.config import TrainConfig
+from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.env import Env
 from apnpql_jax.env_state import EnvState
 from apnpql_jax.replay import Replay

@@ -12,7 +12,7 @@ from statistics import NormalDist
 import time
 from typing import Any, Protocol
 
-from apnpql_jax.config import ConfigError
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.run_folder import write_text
 
 STEP = "step"

@@ -10,7 +10,7 @@ import zlib
 
 import numpy as np
 
-from apnpql_jax.config import ConfigError
+from apnpql_jax.errors import ConfigError
 
 _ERRORS = (OSError, ValueError, EOFError, KeyError, RuntimeError, MemoryError)
 _ERRORS += (NotImplementedError, zipfile.BadZipFile, zlib.error)

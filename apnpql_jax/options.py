@@ -11,7 +11,8 @@ from typing import Annotated, TypeVar
 
 import tyro
 
-from apnpql_jax.config import ConfigError, TrainConfig
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.errors import ConfigError
 
 T = TypeVar("T")
 _Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]

@@ -13,8 +13,8 @@ import mujoco
 import numpy as np
 
 from apnpql_jax import demonstrations, memory, npz
-from apnpql_jax.config import ConfigError
 from apnpql_jax.demonstrations import Demonstrations
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.sim.physics import MAX_VELOCITY
 from apnpql_jax.sim.scene import Scene
 

@@ -9,7 +9,7 @@ import jax
 
 from apnpql_jax import sharding
 from apnpql_jax.agents.learner import Agent
-from apnpql_jax.config import TrainConfig
+from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.env import Env
 from apnpql_jax.evaluate import figures_of, play_held_out
 from apnpql_jax.iteration import TrainState

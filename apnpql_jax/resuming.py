@@ -14,7 +14,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from apnpql_jax import checkpoint, checkpoint_record, metrics, replay
-from apnpql_jax.config import TrainConfig
+from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.iteration import TrainState
 
 

@@ -16,7 +16,8 @@ import subprocess
 from typing import Any
 
 from apnpql_jax import runs
-from apnpql_jax.config import TrainConfig, config_to_json
+from apnpql_jax.config.files import config_to_json
+from apnpql_jax.config.schema import TrainConfig
 
 _PACKAGES = (
   "apnpql-jax jax jaxlib flax optax distrax orbax-checkpoint mujoco mujoco-mjx mink "

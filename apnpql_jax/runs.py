@@ -9,23 +9,13 @@ import os
 from pathlib import Path
 import shutil
 
-from apnpql_jax import codec
-from apnpql_jax.config import (
-  ConfigError,
-  TrainConfig,
-  config_diff,
-  config_from_json,
-  format_diff,
-)
+from apnpql_jax.config import codec
+from apnpql_jax.config.files import config_diff, config_from_json, format_diff
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.errors import ConfigError
 
 CONFIG_FILE = "config.json"
 """Its presence makes a folder a run folder."""
-
-INTERRUPTED = 128
-"""Exit code of a run stopped by a signal, plus the number of the signal."""
-
-FAILED = 3
-"""Exit code of a run that stopped by itself: disk full, or values not finite."""
 
 _MAX_CONFIG_BYTES = 1 << 20
 
@@ -42,15 +32,6 @@ MAY_CHANGE = (
 )
 """Settings that a resumed run may change: none of them alters what is learned from a
 given state of the run."""
-
-
-class RunStopped(Exception):
-  """A run ended before its last step, in order; the one-line message says why."""
-
-  def __init__(self, message: str, code: int):
-    """Keeps the exit code, ``INTERRUPTED`` plus a signal or ``FAILED``."""
-    super().__init__(message)
-    self.code = code
 
 
 def new_run_dir(preset: str, root: Path = Path("runs")) -> Path:

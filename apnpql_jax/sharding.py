@@ -17,7 +17,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, PartitionSpec
 import numpy as np
 
-from apnpql_jax.config import ConfigError
+from apnpql_jax.errors import ConfigError
 
 AXIS = "worlds"
 """The one axis of the mesh; batches are split along it too."""

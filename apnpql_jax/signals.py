@@ -15,7 +15,7 @@ import threading
 import time
 from typing import Any
 
-from apnpql_jax.runs import INTERRUPTED
+from apnpql_jax.errors import INTERRUPTED
 
 _ONE_REQUEST_S = 1.0
 """Signals this close are one request: `timeout` and batch systems send it twice."""

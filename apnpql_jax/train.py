@@ -18,8 +18,8 @@ from jax.sharding import Mesh
 
 from apnpql_jax import (
   checkpoint,
-  codec,
   demonstrations,
+  errors,
   faults,
   leaves,
   memory,
@@ -31,8 +31,10 @@ from apnpql_jax import (
 )
 from apnpql_jax.agents.learner import Agent, make_agent
 from apnpql_jax.checkpoint_writer import CheckpointWriter
-from apnpql_jax.config import TrainConfig
+from apnpql_jax.config import codec
+from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.env import Env, make_env
+from apnpql_jax.errors import RunStopped
 from apnpql_jax.extra_sinks import check_sinks, make_sinks
 from apnpql_jax.iteration import (
   ExpertReplay,
@@ -46,7 +48,6 @@ from apnpql_jax.metrics import MetricWriter
 from apnpql_jax.progress import TrainProgress
 from apnpql_jax.reporter import Reporter, Silent
 from apnpql_jax.run_folder import RunFolder
-from apnpql_jax.runs import RunStopped
 from apnpql_jax.signals import Signals
 
 
@@ -97,12 +98,12 @@ def train(
     try:
       state, evaluation = _run(config, start, signals)
     except OSError as error:  # The disk is full or gone.
-      raise RunStopped(f"{error}; {to_go_on}", runs.FAILED) from error
+      raise RunStopped(f"{error}; {to_go_on}", errors.FAILED) from error
   if int(state.env_steps) < config.total_steps:
     # The signal may have come to another process.
     number = signals.caught[0] if signals.caught else signal.SIGTERM
     raise RunStopped(
-      f"saved at step {int(state.env_steps):,}; {to_go_on}", runs.INTERRUPTED + number
+      f"saved at step {int(state.env_steps):,}; {to_go_on}", errors.INTERRUPTED + number
     )
   return {
     "run": str(start.folder.path),

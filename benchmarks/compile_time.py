@@ -29,8 +29,8 @@ import settings
 import tables
 import tiny
 
-from apnpql_jax.config import BACKENDS
-from apnpql_jax.presets import load_preset
+from apnpql_jax.config.checks import BACKENDS
+from apnpql_jax.config.files import load_preset
 from apnpql_jax.primitives.bank import load_bank
 from apnpql_jax.tasks import make_task, task_names
 

@@ -27,8 +27,8 @@ import tiny
 
 from apnpql_jax.agents import encoder
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import AgentConfig
-from apnpql_jax.presets import load_preset
+from apnpql_jax.config.files import load_preset
+from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.types import Array
 
 sys.path.append(str(tables.ROOT / "tests"))

@@ -24,8 +24,9 @@ import parts
 import settings
 
 from apnpql_jax.agents.learner import Agent, make_agent
-from apnpql_jax.config import ConfigError, TrainConfig
+from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.env import make_env
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.iteration import (
   TrainState,
   empty_expert,

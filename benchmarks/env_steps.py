@@ -23,9 +23,10 @@ import parts
 import settings
 
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import ConfigError, TrainConfig
+from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.env import Env, make_env
 from apnpql_jax.env_state import EnvState
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.rollout import Policy, agent_policy, rollout
 
 

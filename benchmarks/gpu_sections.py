@@ -30,7 +30,7 @@ from ray_layouts import LAYOUTS, SIZES, Layout
 from render import make_pair, make_poses
 
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import EnvConfig
+from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.env import make_env
 from apnpql_jax.env_state import EnvState
 from apnpql_jax.iteration import empty_expert, initial_state, make_iteration

@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import AgentConfig, TrainConfig
+from apnpql_jax.config.files import load_preset
+from apnpql_jax.config.schema import AgentConfig, TrainConfig
 from apnpql_jax.env import make_env
 from apnpql_jax.evaluate import figures_of, play_held_out
 from apnpql_jax.iteration import (
@@ -23,7 +24,6 @@ from apnpql_jax.iteration import (
   initial_state,
   make_iteration,
 )
-from apnpql_jax.presets import load_preset
 from apnpql_jax.rollout import agent_policy, make_player
 
 

@@ -33,11 +33,12 @@ import tables
 
 from apnpql_jax import memory, replay
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import AgentConfig, ConfigError, EnvConfig, TrainConfig
+from apnpql_jax.config.files import load_preset, mjcf_path
+from apnpql_jax.config.schema import AgentConfig, EnvConfig, TrainConfig
 from apnpql_jax.contact_report import SUBSTEPS
 from apnpql_jax.env import make_env
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.iteration import example_slot
-from apnpql_jax.presets import load_preset, mjcf_path
 from apnpql_jax.sim.physics import initial_state, make_physics
 from apnpql_jax.sim.scene import Scene, load_scene
 from apnpql_jax.tasks import make_task

@@ -32,8 +32,8 @@ import tiny
 from apnpql_jax.agents import learner
 from apnpql_jax.agents.learner import Agent, make_agent
 from apnpql_jax.agents.networks import Heads, Networks, Params, make_networks
-from apnpql_jax.config import AgentConfig
-from apnpql_jax.presets import load_preset
+from apnpql_jax.config.files import load_preset
+from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.types import Array, Observation, Transition
 
 sys.path.append(str(tables.ROOT / "tests"))

@@ -20,7 +20,7 @@ import timing
 
 from apnpql_jax.agents.learner import Agent
 from apnpql_jax.cameras import make_cameras
-from apnpql_jax.config import EnvConfig
+from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.contact_report import SUBSTEPS
 from apnpql_jax.env import Env
 from apnpql_jax.env_state import EnvState

@@ -24,10 +24,10 @@ import sides
 import tables
 
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import AgentConfig, EnvConfig
+from apnpql_jax.config.files import load_preset
+from apnpql_jax.config.schema import AgentConfig, EnvConfig
 from apnpql_jax.env import make_env
 from apnpql_jax.env_state import EnvState
-from apnpql_jax.presets import load_preset
 from apnpql_jax.rollout import rollout
 from apnpql_jax.types import Array, Transition
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from apnpql_jax.config import EnvConfig
+from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.env import make_env
 from apnpql_jax.rollout import expert_policy, rollout
 from apnpql_jax.tasks import task_names

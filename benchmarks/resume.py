@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import tiny
 
-from apnpql_jax.config import BACKENDS, OBSERVATIONS
+from apnpql_jax.config.checks import BACKENDS, OBSERVATIONS
 
 Arrays = dict[str, np.ndarray]
 

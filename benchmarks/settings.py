@@ -10,8 +10,9 @@ from typing import Any
 
 import tiny
 
-from apnpql_jax.config import BACKENDS, OBSERVATIONS, TrainConfig
-from apnpql_jax.presets import load_preset
+from apnpql_jax.config.checks import BACKENDS, OBSERVATIONS
+from apnpql_jax.config.files import load_preset
+from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.tasks import task_names
 
 ENGINES = ("native", "mjx")

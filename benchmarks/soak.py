@@ -33,7 +33,7 @@ import damage
 import numpy as np
 import tiny
 
-from apnpql_jax import checkpoint, runs
+from apnpql_jax import checkpoint, errors
 
 RESULTS = Path(__file__).resolve().parent / "results"
 INTERVAL = 512
@@ -131,9 +131,9 @@ EXPECTED = {
   "kill": -signal.SIGKILL,
   "SIGTERM": 128 + signal.SIGTERM,
   "poisoned world": 128 + signal.SIGTERM,
-  "poisoned rewards": runs.FAILED,
+  "poisoned rewards": errors.FAILED,
   "kill in a save": -signal.SIGKILL,
-  "disk full": runs.FAILED,
+  "disk full": errors.FAILED,
   "bit flip": -signal.SIGKILL,
   "SIGINT": 128 + signal.SIGINT,
 }

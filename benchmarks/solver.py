@@ -18,7 +18,7 @@ from pathlib import Path
 
 import apnpql_jax  # noqa: F401  isort: skip  (before JAX: sets threads and cache)
 
-from apnpql_jax.config import EnvConfig
+from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.contact_report import contact_report
 from apnpql_jax.env import Env
 from apnpql_jax.evaluate import play_held_out

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import tables
 
-from apnpql_jax.config import EnvConfig
+from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.contact_report import contact_report
 from apnpql_jax.env import Env, make_env
 from apnpql_jax.evaluate import evaluate_expert

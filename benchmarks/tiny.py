@@ -17,7 +17,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from apnpql_jax import demonstrations, metrics
-from apnpql_jax.config import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
+from apnpql_jax.config.schema import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
 from apnpql_jax.primitives.bank import load_bank
 from apnpql_jax.tasks import make_task
 

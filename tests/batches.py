@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax.config import AgentConfig
+from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.types import Observation, Slot, TimeStep, Transition
 
 SMALL = AgentConfig(

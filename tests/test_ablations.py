@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 import tiny
 
-from apnpql_jax import presets, replay
+from apnpql_jax import replay
 from apnpql_jax.agents.learner import Agent, LearnerState, make_agent
-from apnpql_jax.config import TrainConfig, validate
+from apnpql_jax.config import files
+from apnpql_jax.config.checks import validate
+from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.dists.gmm import GripperGMM
 from apnpql_jax.iteration import make_sample
 from apnpql_jax.options import Train, parse
@@ -66,7 +68,7 @@ class Played(NamedTuple):
 
 
 def configured(flags: str) -> TrainConfig:
-  base = Train(config=presets.load_preset("push_plate"))
+  base = Train(config=files.load_preset("push_plate"))
   # An entropy below its floor, so that nu has something to do from the first update.
   args = [*tiny.PRESET_ARGS, "--agent.epsilon-nu", "5", *flags.split()]
   config = parse(Train, "train", ["push_plate", *args], default=base).config

@@ -16,12 +16,12 @@ import pytest
 from scipy import special
 import tiny
 
-from apnpql_jax import validation
 from apnpql_jax.agents import algorithms, regularisers
 from apnpql_jax.agents.algorithms import ALGORITHMS, algorithm_of
 from apnpql_jax.agents.learner import Agent, bellman_target, make_agent, total_loss
 from apnpql_jax.agents.networks import Heads
 from apnpql_jax.agents.policies import clip_action
+from apnpql_jax.config import checks
 from apnpql_jax.dists.action import ActionDistribution, UniformBox
 from apnpql_jax.types import Array, Metrics, Transition
 
@@ -129,7 +129,7 @@ def test_each_loss_trains_exactly_the_parameters_the_paper_names(name: str):
 
 
 def test_settings_name_every_evaluation():
-  assert {"row", *algorithms.EVALUATIONS} == set(validation.EVALUATIONS)
+  assert {"row", *algorithms.EVALUATIONS} == set(checks.EVALUATIONS)
 
 
 def regulariser_of(name: str, heads: Heads, slow: Heads) -> ActionDistribution:

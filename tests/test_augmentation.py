@@ -12,7 +12,7 @@ import pytest
 
 from apnpql_jax.agents.augmentation import augment, jittered, shifted
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import AgentConfig
+from apnpql_jax.config.schema import AgentConfig
 
 IMAGES = np.random.default_rng(0).integers(0, 256, (3, 5, 12, 16, 3)).astype(np.uint8)
 CONFIG = AgentConfig(

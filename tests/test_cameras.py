@@ -8,7 +8,7 @@ import pytest
 import tiny
 
 from apnpql_jax.cameras import make_cameras, shadows_of_the_hand
-from apnpql_jax.config import EnvConfig
+from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.render import CameraSpec, Geoms, Lighting, render
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.tasks import make_task, task_names

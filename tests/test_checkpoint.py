@@ -24,7 +24,9 @@ import pytest
 
 from apnpql_jax import checkpoint, checkpoint_record, resuming
 from apnpql_jax.checkpoint_writer import CheckpointWriter, SaveError
-from apnpql_jax.config import AgentConfig, ConfigError, TrainConfig, config_to_json
+from apnpql_jax.config.files import config_to_json
+from apnpql_jax.config.schema import AgentConfig, TrainConfig
+from apnpql_jax.errors import ConfigError
 
 CONFIG = TrainConfig()
 

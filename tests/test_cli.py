@@ -12,9 +12,11 @@ import sys
 
 import pytest
 
-from apnpql_jax import presets
 from apnpql_jax.cli import _plain
-from apnpql_jax.config import BACKENDS, TrainConfig, config_to_json
+from apnpql_jax.config import files
+from apnpql_jax.config.checks import BACKENDS
+from apnpql_jax.config.files import config_to_json
+from apnpql_jax.config.schema import TrainConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -38,7 +40,7 @@ def run_dir(tmp_path: Path) -> Path:
   """A run folder with nothing but its configuration."""
   folder = tmp_path / "runs" / "old"
   folder.mkdir(parents=True)
-  config = presets.load_preset("push_plate")
+  config = files.load_preset("push_plate")
   (folder / "config.json").write_text(config_to_json(config))
   return folder
 
@@ -176,7 +178,7 @@ def test_help_names_every_command_and_every_setting(tmp_path):
 def test_help_of_a_preset_shows_its_settings(tmp_path):
   done = apnpql("train", "push_plate", "--help", cwd=tmp_path)
   shown = re.sub(r"[\s│]+", " ", done.stdout)
-  preset = presets.load_preset("push_plate")
+  preset = files.load_preset("push_plate")
   assert preset.total_steps != TrainConfig().total_steps
   assert f"(default: {preset.total_steps})" in shown
 

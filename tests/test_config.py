@@ -11,22 +11,17 @@ import math
 from hypothesis import given, settings, strategies as st
 import pytest
 
-from apnpql_jax import codec, config as config_module, presets
-from apnpql_jax.config import (
-  AgentConfig,
-  ConfigError,
-  EnvConfig,
-  RandomizationConfig,
-  ReplayConfig,
-  TrainConfig,
+from apnpql_jax.config import codec, files, ranges, schema as config_module
+from apnpql_jax.config.checks import replay_bytes, validate
+from apnpql_jax.config.files import (
   config_diff,
   config_from_json,
   config_to_json,
   format_diff,
-  replay_bytes,
-  validate,
 )
-from apnpql_jax.randomization import ranges
+from apnpql_jax.config.ranges import RandomizationConfig
+from apnpql_jax.config.schema import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
+from apnpql_jax.errors import ConfigError
 
 POSITIVE = st.floats(1e-6, 1e6, allow_nan=False)
 
@@ -76,8 +71,8 @@ def edited(path: str, value: object) -> str:
 
 def test_defaults_and_presets_are_valid():
   validate(TrainConfig())
-  for name in presets.preset_names():
-    validate(presets.load_preset(name))
+  for name in files.preset_names():
+    validate(files.load_preset(name))
 
 
 def test_every_field_has_a_docstring():

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from apnpql_jax.config import EnvConfig, ReplayConfig
+from apnpql_jax.config.schema import EnvConfig, ReplayConfig
 from apnpql_jax.env import make_env
 from apnpql_jax.rollout import expert_policy
 from apnpql_jax.sim import physics

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation, Slerp
 import tiny
 
 from apnpql_jax import cli, demonstrations, recordings
-from apnpql_jax.config import ConfigError
 from apnpql_jax.demonstrations import Demonstrations
 from apnpql_jax.env import Env, make_env
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.rollout import expert_policy, make_player
 from apnpql_jax.sim.physics import START_TIME, Physics, PhysicsState
 

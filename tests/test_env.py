@@ -12,7 +12,7 @@ from scipy import stats
 
 from apnpql_jax import evaluate, replay
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import AgentConfig, EnvConfig
+from apnpql_jax.config.schema import AgentConfig, EnvConfig
 from apnpql_jax.env import Env, make_env
 from apnpql_jax.evaluate import play_held_out
 from apnpql_jax.iteration import example_slot

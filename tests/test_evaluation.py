@@ -15,7 +15,8 @@ import rlax
 from apnpql_jax.agents import objectives
 from apnpql_jax.agents.algorithms import algorithm_of
 from apnpql_jax.agents.learner import bellman_target, make_agent
-from apnpql_jax.config import AgentConfig, ConfigError
+from apnpql_jax.config.schema import AgentConfig
+from apnpql_jax.errors import ConfigError
 
 N = 4
 BATCH = 5

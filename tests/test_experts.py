@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from apnpql_jax.config import EnvConfig, ReplayConfig
+from apnpql_jax.config.schema import EnvConfig, ReplayConfig
 from apnpql_jax.env import HISTORY, Env, make_env
 from apnpql_jax.env_state import EnvState
 from apnpql_jax.evaluate import play_held_out

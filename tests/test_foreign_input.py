@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from apnpql_jax import npz, run_folder, runs
-from apnpql_jax.codec import flatten
-from apnpql_jax.config import ConfigError, TrainConfig, config_from_json, config_to_json
+from apnpql_jax.config.codec import flatten
+from apnpql_jax.config.files import config_from_json, config_to_json
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.errors import ConfigError
 
 NUMBERS = st.one_of(
   st.integers(), st.floats(), st.sampled_from([0, -1, 1, 2**31, 2**63, 10**400])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from apnpql_jax.config import EnvConfig
+from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.env import Env, make_env
 from apnpql_jax.sim import physics
 from apnpql_jax.tasks import task_names

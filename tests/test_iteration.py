@@ -20,18 +20,19 @@ import tiny
 from apnpql_jax import (
   checkpoint,
   cli,
+  errors,
   faults,
   leaves,
   replay,
   resuming,
   run_folder,
-  runs,
 )
 from apnpql_jax.agents.algorithms import ALGORITHMS
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.checkpoint_writer import CheckpointWriter
-from apnpql_jax.config import ConfigError, TrainConfig
+from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.env import Env, make_env
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.iteration import (
   TrainState,
   collect_expert,
@@ -312,9 +313,9 @@ def test_after_several_the_run_stops_and_the_update_can_be_repeated(
   faults.check(built.config, state, folder)
   assert not folder.faults.exists()
   after, _ = iteration(_poison_replay(state))
-  with pytest.raises(runs.RunStopped, match="2 updates in a row") as stop:
+  with pytest.raises(errors.RunStopped, match="2 updates in a row") as stop:
     faults.check(built.config, after, folder)
-  assert stop.value.code == runs.FAILED
+  assert stop.value.code == errors.FAILED
   (file,) = folder.faults.iterdir()
   # The message ends with a command line that works as it stands.
   command = str(stop.value).rpartition("apnpql ")[2].split()

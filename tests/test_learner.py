@@ -13,7 +13,8 @@ import pytest
 
 from apnpql_jax.agents.algorithms import ALGORITHMS
 from apnpql_jax.agents.learner import make_agent, make_optimiser
-from apnpql_jax.config import AgentConfig, ConfigError
+from apnpql_jax.config.schema import AgentConfig
+from apnpql_jax.errors import ConfigError
 
 CONFIG = AgentConfig(
   hidden=(32, 32),

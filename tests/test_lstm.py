@@ -15,7 +15,7 @@ import tiny
 
 from apnpql_jax import replay
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import AgentConfig
+from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.replay import Replay
 from apnpql_jax.types import Observation, Slot, TimeStep
 

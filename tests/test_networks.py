@@ -16,9 +16,9 @@ from apnpql_jax.agents import encoder
 from apnpql_jax.agents.evaluation import Categorical
 from apnpql_jax.agents.mixture import mixture_from_outputs, one_way_clip
 from apnpql_jax.agents.networks import GROUPS, Heads, Networks, make_networks
-from apnpql_jax.config import AgentConfig
+from apnpql_jax.config.checks import IMAGE_FEATURES
+from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.types import Observation
-from apnpql_jax.validation import IMAGE_FEATURES
 
 CONFIG = AgentConfig(
   hidden=(24, 16), feature_dim=20, num_atoms=11, patch_channels=5, conv_channels=6

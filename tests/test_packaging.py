@@ -16,8 +16,8 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 import pytest
 
-from apnpql_jax import presets
-from apnpql_jax.config import ConfigError
+from apnpql_jax.config import files
+from apnpql_jax.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -84,7 +84,7 @@ def test_wheel_works_from_another_directory(installed, tmp_path):
     assert Path(line).is_relative_to(installed)
   out = python(installed, tmp_path, "-m", "apnpql_jax", "list", "--json")
   names = json.loads(out)
-  assert names["presets"] == presets.preset_names()
+  assert names["presets"] == files.preset_names()
   assert set(names["presets"]) == {*names["tasks"], "sim_to_real"}
 
 
@@ -132,6 +132,6 @@ def test_mujoco_and_mjx_are_a_matched_pair():
 )
 def test_names_cannot_leave_their_folder(name):
   with pytest.raises(ConfigError, match="push_plate"):
-    presets.load_preset(name)
+    files.load_preset(name)
   with pytest.raises(ConfigError, match="push_plate"):
-    presets.mjcf_path(name)
+    files.mjcf_path(name)

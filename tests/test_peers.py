@@ -17,7 +17,7 @@ import sections
 import sides
 import urdf
 
-from apnpql_jax.presets import load_preset
+from apnpql_jax.config.files import load_preset
 from apnpql_jax.sim import mjx_patches
 from apnpql_jax.tasks import make_task, task_names
 

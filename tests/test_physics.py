@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from apnpql_jax.config import ConfigError
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.sim.mjx import MjxPhysics

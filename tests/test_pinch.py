@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from apnpql_jax.presets import mjcf_path
+from apnpql_jax.config.files import mjcf_path
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.tasks import make_task

@@ -16,7 +16,7 @@ from scipy import special
 from apnpql_jax.agents import policies, projections
 from apnpql_jax.agents.evaluation import TD0
 from apnpql_jax.agents.networks import GROUPS, Heads, make_networks
-from apnpql_jax.config import AgentConfig
+from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.dists.action import UniformBox
 
 CONFIG = AgentConfig(hidden=(8, 8), feature_dim=8, policy_samples=400)

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from apnpql_jax import presets
-from apnpql_jax.config import ConfigError, TrainConfig
+from apnpql_jax.config import files
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.errors import ConfigError
 
 
 @pytest.fixture
@@ -15,7 +16,7 @@ def package(tmp_path: Path, monkeypatch) -> Path:
   """An empty package folder, as in a checkout: its folders lie beside it."""
   folder = tmp_path / "apnpql_jax"
   folder.mkdir()
-  monkeypatch.setattr(presets, "_PACKAGE", folder)
+  monkeypatch.setattr(files, "_PACKAGE", folder)
   return folder
 
 
@@ -29,19 +30,19 @@ def test_names_are_plain_words_in_order(package):
   for name in ("b.py", "a_2.py", "_private.py", "__init__.py", "Big.py", "c-d.py"):
     write(folder, name, "raise RuntimeError('listing must not run this')")
   write(folder, "notes.txt", "")
-  assert presets.preset_names() == ["a_2", "b"]
+  assert files.preset_names() == ["a_2", "b"]
 
 
 def test_installed_folder_is_preferred(package):
   write(package.parent / "experiments", "outside.py", "")
   write(package / "experiments", "inside.py", "")
-  assert presets.preset_names() == ["inside"]
+  assert files.preset_names() == ["inside"]
 
 
 def test_configuration_of_a_preset_is_loaded(package):
-  text = "from apnpql_jax.config import TrainConfig\nCONFIG = TrainConfig(seed=7)"
+  text = "from apnpql_jax import TrainConfig\nCONFIG = TrainConfig(seed=7)"
   write(package.parent / "experiments", "seven.py", text)
-  assert presets.load_preset("seven") == TrainConfig(seed=7)
+  assert files.load_preset("seven") == TrainConfig(seed=7)
 
 
 @pytest.mark.parametrize(
@@ -49,19 +50,19 @@ def test_configuration_of_a_preset_is_loaded(package):
   [
     ("", "CONFIG = TrainConfig"),
     ("CONFIG = {}", "CONFIG = TrainConfig"),
-    ("from apnpql_jax.config import EnvConfig\nEnvConfig(tusk='x')", "tusk"),
+    ("from apnpql_jax import EnvConfig\nEnvConfig(tusk='x')", "tusk"),
     ("CONFIG = (", "SyntaxError"),
   ],
 )
 def test_preset_that_is_none_is_refused(package, text, message):
   write(package.parent / "experiments", "broken.py", text)
   with pytest.raises(ConfigError, match="'broken'") as error:
-    presets.load_preset("broken")
+    files.load_preset("broken")
   assert message in str(error.value)
 
 
 def test_scene_that_does_not_exist_names_those_that_do(package):
   write(package.parent / "mjcf", "kitchen.xml", "")
-  assert presets.mjcf_path("kitchen") == package.parent / "mjcf" / "kitchen.xml"
+  assert files.mjcf_path("kitchen") == package.parent / "mjcf" / "kitchen.xml"
   with pytest.raises(ConfigError, match="'cellar'; choose from kitchen"):
-    presets.mjcf_path("cellar")
+    files.mjcf_path("cellar")

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 import tiny
 
-from apnpql_jax.config import EnvConfig, RandomizationConfig
+from apnpql_jax.config.ranges import RandomizationConfig
+from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.env import Env, make_env
 from apnpql_jax.randomization.draw import free_bodies
 from apnpql_jax.randomization.worlds import make_randomize

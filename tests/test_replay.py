@@ -14,7 +14,7 @@ import pytest
 from scipy import stats
 
 from apnpql_jax import leaves, memory, replay as rb
-from apnpql_jax.config import ConfigError
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.types import Observation, Slot, TimeStep, Transition
 
 GAMMA = 0.9

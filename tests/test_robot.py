@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from apnpql_jax.presets import mjcf_path
+from apnpql_jax.config.files import mjcf_path
 from apnpql_jax.sim import arm
 
 ORACLE = json.loads((Path(__file__).parent / "data" / "ur5e_oracle.json").read_text())

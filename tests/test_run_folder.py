@@ -13,7 +13,8 @@ import jax
 import pytest
 
 from apnpql_jax import run_folder
-from apnpql_jax.config import ConfigError, EnvConfig, TrainConfig
+from apnpql_jax.config.schema import EnvConfig, TrainConfig
+from apnpql_jax.errors import ConfigError
 
 CONFIG = TrainConfig(env=EnvConfig(worlds=64), seed=3)
 

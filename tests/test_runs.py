@@ -11,7 +11,9 @@ import sys
 import pytest
 
 from apnpql_jax import runs
-from apnpql_jax.config import AgentConfig, ConfigError, TrainConfig, config_to_json
+from apnpql_jax.config.files import config_to_json
+from apnpql_jax.config.schema import AgentConfig, TrainConfig
+from apnpql_jax.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[1]
 

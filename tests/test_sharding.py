@@ -30,8 +30,10 @@ import tiny
 from apnpql_jax import checkpoint, cli, leaves, resuming, runs, sharding
 from apnpql_jax.agents.learner import LearnerState, make_agent
 from apnpql_jax.checkpoint_writer import CheckpointWriter
-from apnpql_jax.config import ConfigError, TrainConfig, validate
+from apnpql_jax.config.checks import validate
+from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.env import make_env
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.iteration import (
   TrainState,
   collect_expert,

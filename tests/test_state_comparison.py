@@ -8,7 +8,8 @@ import pytest
 import state_comparison as comparison
 
 from apnpql_jax.agents.algorithms import epsilon_bounds
-from apnpql_jax.config import config_diff, validate
+from apnpql_jax.config.checks import validate
+from apnpql_jax.config.files import config_diff
 
 RUNS = [*itertools.product(comparison.TASKS, comparison.ROWS)]
 

@@ -18,7 +18,7 @@ import pytest
 
 from apnpql_jax import replay
 from apnpql_jax.agents.learner import Agent, LearnerState, make_agent
-from apnpql_jax.config import AgentConfig
+from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.types import Array, Observation, Slot, TimeStep
 
 WORLDS = 32

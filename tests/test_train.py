@@ -16,13 +16,8 @@ import numpy as np
 import pytest
 
 from apnpql_jax import checkpoint, run_folder
-from apnpql_jax.config import (
-  AgentConfig,
-  ConfigError,
-  EnvConfig,
-  ReplayConfig,
-  TrainConfig,
-)
+from apnpql_jax.config.schema import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.evaluate import evaluate_run
 from apnpql_jax.recording import HOLD
 from apnpql_jax.train import train

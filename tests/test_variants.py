@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import render_oracles
 
-from apnpql_jax.config import EnvConfig
+from apnpql_jax.config.files import mjcf_path
+from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.env import Env, make_env
-from apnpql_jax.presets import mjcf_path
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.tasks import flip_cup, make_task

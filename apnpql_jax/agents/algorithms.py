@@ -28,8 +28,9 @@ from apnpql_jax.agents.regularisers import (
   previous_policy,
   uniform,
 )
-from apnpql_jax.config import AgentConfig, ConfigError, check_name
+from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.dists.action import ActionDistribution
+from apnpql_jax.errors import ConfigError, check_name
 
 
 @dataclasses.dataclass(frozen=True)

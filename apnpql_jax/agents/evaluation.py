@@ -17,7 +17,7 @@ import numpy as np
 
 from apnpql_jax.agents import objectives
 from apnpql_jax.agents.modules import TwinValueHeads, ValueHead
-from apnpql_jax.config import AgentConfig
+from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.dists import categorical
 from apnpql_jax.types import Array, Observation, Transition
 

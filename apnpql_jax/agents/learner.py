@@ -16,7 +16,8 @@ from apnpql_jax.agents.algorithms import Algorithm, algorithm_of, epsilon_bounds
 from apnpql_jax.agents.augmentation import augment
 from apnpql_jax.agents.networks import Heads, Networks, Params, make_networks
 from apnpql_jax.agents.policies import Candidates
-from apnpql_jax.config import AgentConfig, TrainConfig, validate
+from apnpql_jax.config.checks import validate
+from apnpql_jax.config.schema import AgentConfig, TrainConfig
 from apnpql_jax.dists import boltzmann
 from apnpql_jax.types import Array, Metrics, Observation, Transition
 

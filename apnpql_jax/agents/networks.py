@@ -20,7 +20,7 @@ from apnpql_jax.agents.encoder import Encoder
 from apnpql_jax.agents.evaluation import Evaluation
 from apnpql_jax.agents.mixture import mixture_from_outputs, mixture_size
 from apnpql_jax.agents.modules import Constant, Head
-from apnpql_jax.config import AgentConfig
+from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.dists.gmm import GripperGMM
 from apnpql_jax.types import (
   ACTION_DIM,

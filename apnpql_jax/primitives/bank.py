@@ -27,7 +27,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from apnpql_jax.config import ConfigError
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.primitives import ik
 from apnpql_jax.runtime import cache_dir, cores
 from apnpql_jax.sim import physics

@@ -11,7 +11,7 @@ import mink
 import mujoco
 import numpy as np
 
-from apnpql_jax.presets import mjcf_path
+from apnpql_jax.config.files import mjcf_path
 
 TOOL_SITE = "tool"
 MAX_ITERATIONS = 60

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from apnpql_jax.config import RandomizationConfig
+from apnpql_jax.config.ranges import RandomizationConfig
 from apnpql_jax.render import Lighting
 from apnpql_jax.types import Array
 

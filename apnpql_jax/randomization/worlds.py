@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax.config import RandomizationConfig
+from apnpql_jax.config.ranges import RandomizationConfig
 from apnpql_jax.randomization import looks, objects
 from apnpql_jax.randomization.draw import Draw, World
 from apnpql_jax.sim.physics import GRIPPER_SPEED, PhysicsState

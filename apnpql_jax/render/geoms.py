@@ -12,7 +12,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from apnpql_jax.config import ConfigError
+from apnpql_jax.errors import ConfigError
 
 _TYPES = mujoco.mjtGeom
 SUPPORTED = (

@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax.config import BACKENDS, check_name
+from apnpql_jax.config.checks import BACKENDS
+from apnpql_jax.errors import check_name
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
 

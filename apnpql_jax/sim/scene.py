@@ -15,7 +15,7 @@ import mujoco
 from mujoco import mjx
 import numpy as np
 
-from apnpql_jax.config import ConfigError
+from apnpql_jax.errors import ConfigError
 
 ARM_JOINTS = (
   "shoulder_pan",

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from apnpql_jax.presets import mjcf_path
+from apnpql_jax.config.files import mjcf_path
 from apnpql_jax.sim import arm
 from apnpql_jax.sim.scene import load_scene
 from apnpql_jax.types import Array

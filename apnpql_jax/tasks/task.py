@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from apnpql_jax.config import check_name
+from apnpql_jax.errors import check_name
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.sim.scene import Scene

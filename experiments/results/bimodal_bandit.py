@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import AgentConfig
+from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.types import Array, Observation, Transition
 
 PEAKS = ((0.6, 0.6), (-0.6, -0.6))

@@ -32,10 +32,15 @@ import matplotlib.pyplot as plt
 import numpy as np
 from summarize import GOAL
 
-from apnpql_jax.config import TrainConfig, config_diff, config_from_json, format_diff
+from apnpql_jax.config.files import (
+  config_diff,
+  config_from_json,
+  format_diff,
+  load_preset,
+)
+from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.metrics import read_rows
 from apnpql_jax.options import Train, parse
-from apnpql_jax.presets import load_preset
 from apnpql_jax.run_folder import RunFolder, open_run
 
 OUT = Path(__file__).resolve().with_suffix("")

@@ -8,14 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 import math
-from typing import TYPE_CHECKING
 
-from apnpql_jax import codec
-from apnpql_jax.codec import ConfigError
-from apnpql_jax.randomization.ranges import validate_ranges
-
-if TYPE_CHECKING:
-  from apnpql_jax.config import AgentConfig, EnvConfig, TrainConfig
+from apnpql_jax.config import codec
+from apnpql_jax.config.ranges import validate_ranges
+from apnpql_jax.config.schema import AgentConfig, EnvConfig, TrainConfig
+from apnpql_jax.errors import ConfigError, check_name
 
 BACKENDS = ("auto", "mjx", "native")
 OBSERVATIONS = ("pixels", "state")
@@ -98,12 +95,6 @@ def validate(
   ):
     if number % devices:
       raise ConfigError(f"{name}={number} must be a multiple of the {devices} devices")
-
-
-def check_name(field: str, value: str, valid: Sequence[str]) -> None:
-  """Raises ConfigError naming the valid choices unless ``value`` is one of them."""
-  if value not in valid:
-    raise ConfigError(f"unknown {field} {value!r}; choose from {', '.join(valid)}")
 
 
 def replay_bytes(config: TrainConfig) -> int:

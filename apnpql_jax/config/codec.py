@@ -10,14 +10,12 @@ import dataclasses
 import json
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
+from apnpql_jax.errors import ConfigError
+
 T = TypeVar("T")
 
 _BEFORE = "before"
 """In the metadata of a field: its value in texts that were written without it."""
-
-
-class ConfigError(ValueError):
-  """A setting that cannot work; its one-line message says what to write instead."""
 
 
 def added(default: Any, *, before: Any = None) -> Any:

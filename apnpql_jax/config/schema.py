@@ -8,23 +8,11 @@ still be resumed and evaluated. This module imports neither JAX nor MuJoCo, so t
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import dataclasses
 import math
-from typing import Any
 
-from apnpql_jax import codec
-from apnpql_jax.codec import ConfigError as ConfigError
-from apnpql_jax.randomization.ranges import (
-  RandomizationConfig as RandomizationConfig,
-)
-from apnpql_jax.validation import (
-  BACKENDS as BACKENDS,
-  OBSERVATIONS as OBSERVATIONS,
-  check_name as check_name,
-  replay_bytes as replay_bytes,
-  validate as validate,
-)
+from apnpql_jax.config import codec
+from apnpql_jax.config.ranges import RandomizationConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -304,37 +292,3 @@ class TrainConfig:
 
   sinks: tuple[str, ...] = ()
   """Where metrics go besides the run folder: tensorboard, wandb."""
-
-
-def config_to_json(config: TrainConfig) -> str:
-  """The configuration as indented JSON text, nested like the dataclasses."""
-  return codec.to_json(config)
-
-
-def config_from_json(
-  text: str, say: Callable[[str], None] = codec.unsaid
-) -> TrainConfig:
-  """Reads and validates what ``config_to_json`` wrote; nothing is executed.
-
-  Args:
-    text: the configuration.
-    say: is told in one line which settings came after it was written, if any.
-
-  Raises:
-    ConfigError: not JSON, a key unknown, missing or of the wrong type, or a
-      setting that cannot work.
-  """
-  config = codec.from_json(TrainConfig, text, say)
-  validate(config)
-  return config
-
-
-def config_diff(a: TrainConfig, b: TrainConfig) -> dict[str, tuple[Any, Any]]:
-  """Dotted field name -> (value in ``a``, value in ``b``) where the two differ."""
-  other = dict(codec.flatten(b))
-  return {k: (v, other[k]) for k, v in codec.flatten(a) if v != other[k]}
-
-
-def format_diff(diff: dict[str, tuple[Any, Any]]) -> str:
-  """One line such as ``agent.gamma 0.99 -> 0.95, seed 0 -> 1``."""
-  return ", ".join(f"{name} {a} -> {b}" for name, (a, b) in diff.items())

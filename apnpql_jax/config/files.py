@@ -6,13 +6,18 @@ lie beside it. Names are plain words, so that a name can never leave the folder.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import importlib.util
 from pathlib import Path
 import re
+from typing import Any
 
-from apnpql_jax.config import ConfigError, TrainConfig, check_name
+from apnpql_jax.config import codec
+from apnpql_jax.config.checks import validate
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.errors import ConfigError, check_name
 
-_PACKAGE = Path(__file__).resolve().parent
+_PACKAGE = Path(__file__).resolve().parents[1]
 _NAME = re.compile(r"[a-z0-9_]+")
 
 
@@ -53,6 +58,40 @@ def mjcf_path(name: str) -> Path:
   """
   check_name("MJCF file", name, _names("mjcf", ".xml"))
   return _folder("mjcf") / f"{name}.xml"
+
+
+def config_to_json(config: TrainConfig) -> str:
+  """The configuration as indented JSON text, nested like the dataclasses."""
+  return codec.to_json(config)
+
+
+def config_from_json(
+  text: str, say: Callable[[str], None] = codec.unsaid
+) -> TrainConfig:
+  """Reads and validates what ``config_to_json`` wrote; nothing is executed.
+
+  Args:
+    text: the configuration.
+    say: is told in one line which settings came after it was written, if any.
+
+  Raises:
+    ConfigError: not JSON, a key unknown, missing or of the wrong type, or a
+      setting that cannot work.
+  """
+  config = codec.from_json(TrainConfig, text, say)
+  validate(config)
+  return config
+
+
+def config_diff(a: TrainConfig, b: TrainConfig) -> dict[str, tuple[Any, Any]]:
+  """Dotted field name -> (value in ``a``, value in ``b``) where the two differ."""
+  other = dict(codec.flatten(b))
+  return {k: (v, other[k]) for k, v in codec.flatten(a) if v != other[k]}
+
+
+def format_diff(diff: dict[str, tuple[Any, Any]]) -> str:
+  """One line such as ``agent.gamma 0.99 -> 0.95, seed 0 -> 1``."""
+  return ", ".join(f"{name} {a} -> {b}" for name, (a, b) in diff.items())
 
 
 def _names(folder: str, suffix: str) -> list[str]:

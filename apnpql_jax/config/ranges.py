@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 
-from apnpql_jax import codec
-from apnpql_jax.codec import ConfigError
+from apnpql_jax.config import codec
+from apnpql_jax.errors import ConfigError
 
 MAX_SHARE = 0.5
 """Largest range of a share: nothing shrinks to nothing."""
