@@ -17,7 +17,7 @@ from apnpql_jax.commands import Json
 from apnpql_jax.config import files
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.options import Collect, Convert, Evaluate, List, Repeat, Train, parse
-from apnpql_jax.signals import Signals
+from apnpql_jax.runs.signals import Signals
 
 
 def main(argv: Sequence[str] | None = None) -> int:

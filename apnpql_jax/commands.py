@@ -13,12 +13,12 @@ from pathlib import Path
 import sys
 from typing import TYPE_CHECKING, Any
 
-from apnpql_jax import runs
 from apnpql_jax.config import files
 from apnpql_jax.config.checks import BACKENDS, validate
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.options import Collect, Convert, Evaluate, List, Repeat, Train, parse
+from apnpql_jax.runs import run_folder
 
 if TYPE_CHECKING:
   from jax.sharding import Mesh
@@ -36,16 +36,16 @@ def train(args: Train, argv: Sequence[str]) -> Json:
   if args.preset:
     base = files.load_preset(args.preset)
   else:
-    base = runs.load_run_config(args.resume or Path(), _tell)
+    base = run_folder.load_run_config(args.resume or Path(), _tell)
   # Parsed a second time, now on top of the settings asked for.
   args = parse(Train, "train", argv, default=Train(config=base))
   config = _with_shortcuts(args)
-  run_dir = args.resume or args.run or runs.new_run_dir(args.preset)
+  run_dir = args.resume or args.run or run_folder.new_run_dir(args.preset)
   if args.resume is None:
-    runs.check_free(run_dir, overwrite=args.overwrite)
+    run_folder.check_free(run_dir, overwrite=args.overwrite)
   validate(config)
   if args.resume is not None:
-    runs.check_resumable(args.resume, config)
+    run_folder.check_resumable(args.resume, config)
   mesh = _mesh(args)
   _check_registered(config, devices=mesh.size if mesh else 1)
 
@@ -71,7 +71,7 @@ def evaluate(args: Evaluate, argv: Sequence[str]) -> Json:
   _check_video(args.video)
   if args.backend is not None:
     check_name("backend", args.backend, BACKENDS)
-  runs.load_run_config(Path(args.run), _tell)
+  run_folder.load_run_config(Path(args.run), _tell)
 
   from apnpql_jax.evaluate import evaluate_run
 
@@ -141,7 +141,7 @@ def repeat(args: Repeat, argv: Sequence[str]) -> Json:
   if not args.file:
     raise ConfigError("repeat needs a file: apnpql repeat RUN/faults/step_<n>.npz")
   path = Path(args.file).absolute()
-  runs.load_run_config(path.parent.parent, _tell)
+  run_folder.load_run_config(path.parent.parent, _tell)
 
   from apnpql_jax import faults
 
@@ -205,7 +205,7 @@ def _checkpoint_step(args: Evaluate) -> int | None:
   if args.checkpoint == "newest":
     return None
   if args.checkpoint == "best":
-    from apnpql_jax.checkpoint import best_step
+    from apnpql_jax.runs.checkpoint_reader import best_step
 
     return best_step(Path(args.run))
   if args.checkpoint.isdigit():

@@ -13,11 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax import checkpoint, leaves, memory, run_folder
+from apnpql_jax import memory
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.env import Env, make_env
-from apnpql_jax.metrics import wilson_interval
 from apnpql_jax.recording import record_episodes
 from apnpql_jax.rollout import (
   Episodes,
@@ -26,6 +25,8 @@ from apnpql_jax.rollout import (
   expert_policy,
   make_player,
 )
+from apnpql_jax.runs import checkpoint_reader, leaves, run_folder
+from apnpql_jax.runs.metrics import wilson_interval
 
 MAX_WORLDS = 64
 """Episodes played at once; more are played in turn."""
@@ -99,7 +100,7 @@ def evaluate_run(
   """
   began = time.monotonic()
   config = run_folder.open_run(run_dir).config
-  checkpoint.check(run_dir, step, config=config)
+  checkpoint_reader.check(run_dir, step, config=config)
   env_config = dataclasses.replace(config.env, backend=backend or config.env.backend)
   env = make_env(env_config, instants=config.agent.lstm_instants)
   agent = make_agent(config.agent)
@@ -108,7 +109,7 @@ def evaluate_run(
     jnp.zeros(1, jnp.int32),
   )
   memory.check_memory(leaves.nbytes(example), "the learner")
-  found = checkpoint.restore(run_dir, step, {"learner": example}, config=config)
+  found = checkpoint_reader.restore(run_dir, step, {"learner": example}, config=config)
   for line in found.damaged:
     print(line, file=sys.stderr)
   learner = found.items["learner"]

@@ -14,12 +14,13 @@ from jax.experimental import multihost_utils
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax import errors, leaves, npz, runs, sharding
+from apnpql_jax import errors, npz, sharding
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.iteration import TrainState, make_sample
-from apnpql_jax.run_folder import RunFolder
+from apnpql_jax.runs import leaves, run_folder
+from apnpql_jax.runs.run_folder import RunFolder
 from apnpql_jax.types import Observation, Slot, TimeStep, Transition
 
 _MAX_BYTES = 2 << 30
@@ -69,7 +70,7 @@ def repeat(path: Path) -> dict[str, list[str]]:
   Raises:
     ConfigError: it is no such file, or does not lie in its run folder.
   """
-  config = runs.load_run_config(path.absolute().parent.parent)
+  config = run_folder.load_run_config(path.absolute().parent.parent)
   arrays = npz.read(path, limit=_MAX_BYTES)
   agent = make_agent(config.agent)
   try:

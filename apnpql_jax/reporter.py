@@ -13,11 +13,11 @@ from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.env import Env
 from apnpql_jax.evaluate import figures_of, play_held_out
 from apnpql_jax.iteration import TrainState
-from apnpql_jax.metrics import MetricWriter, plot_curve, read_evaluations
-from apnpql_jax.progress import TrainProgress
 from apnpql_jax.recording import record_episodes
 from apnpql_jax.rollout import agent_policy, make_player
-from apnpql_jax.run_folder import RunFolder
+from apnpql_jax.runs.metrics import MetricWriter, plot_curve, read_evaluations
+from apnpql_jax.runs.progress import TrainProgress
+from apnpql_jax.runs.run_folder import RunFolder
 
 EVAL_SEED = 1
 """Evaluations during training always play the same held-out episodes."""

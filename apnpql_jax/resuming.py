@@ -13,9 +13,10 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from apnpql_jax import checkpoint, checkpoint_record, metrics, replay
+from apnpql_jax import replay
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.iteration import TrainState
+from apnpql_jax.runs import checkpoint_reader, checkpoint_record, metrics
 
 
 def to_items(state: TrainState, *, whole: bool) -> dict[str, Any]:
@@ -39,7 +40,7 @@ def restore(
     say: is told which checkpoints could not be used, and what is older than the rest.
   """
   items = to_items(example, whole=True)
-  found = checkpoint.restore(run_dir, None, items, config=config)
+  found = checkpoint_reader.restore(run_dir, None, items, config=config)
   for line in found.damaged:
     say(line)
   if found.damaged:
@@ -66,7 +67,7 @@ def set_aside(run_dir: Path, step: int) -> Path | None:
   Returns:
     the folder; None, and nothing is done, if there are no such checkpoints.
   """
-  later = [number for number in checkpoint.all_steps(run_dir) if number > step]
+  later = [number for number in checkpoint_reader.all_steps(run_dir) if number > step]
   if not later:
     return None
   aside = run_dir / "set_aside"

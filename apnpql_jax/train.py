@@ -17,25 +17,19 @@ from typing import Any
 from jax.sharding import Mesh
 
 from apnpql_jax import (
-  checkpoint,
   demonstrations,
   errors,
   faults,
-  leaves,
   memory,
   replay,
   resuming,
-  run_folder,
-  runs,
   sharding,
 )
 from apnpql_jax.agents.learner import Agent, make_agent
-from apnpql_jax.checkpoint_writer import CheckpointWriter
 from apnpql_jax.config import codec
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.env import Env, make_env
 from apnpql_jax.errors import RunStopped
-from apnpql_jax.extra_sinks import check_sinks, make_sinks
 from apnpql_jax.iteration import (
   ExpertReplay,
   TrainState,
@@ -44,11 +38,14 @@ from apnpql_jax.iteration import (
   initial_state,
   make_iteration,
 )
-from apnpql_jax.metrics import MetricWriter
-from apnpql_jax.progress import TrainProgress
 from apnpql_jax.reporter import Reporter, Silent
-from apnpql_jax.run_folder import RunFolder
-from apnpql_jax.signals import Signals
+from apnpql_jax.runs import checkpoint_reader, leaves, run_folder, versions
+from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
+from apnpql_jax.runs.metrics import MetricWriter
+from apnpql_jax.runs.progress import TrainProgress
+from apnpql_jax.runs.run_folder import RunFolder
+from apnpql_jax.runs.signals import Signals
+from apnpql_jax.runs.sinks import check_sinks, make_sinks
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +116,7 @@ def _run(
   """Opens what is written to, and trains; returns the last evaluation too."""
   path = start.folder.path
   with (
-    runs.alone(path) if sharding.leads() else contextlib.nullcontext(),
+    run_folder.lock(path) if sharding.leads() else contextlib.nullcontext(),
     _reporting(config, start) as reporter,
     CheckpointWriter(path, config, keep=config.keep_checkpoints) as saver,
   ):
@@ -173,11 +170,11 @@ def _start(
   devices = mesh.size if mesh else 1
   if resume:
     folder = run_folder.open_run(run_dir)
-    for change in run_folder.changed_versions(folder, devices=devices):
+    for change in versions.changed_versions(folder.versions, devices=devices):
       _say(f"not as when the run began: {change}")
-  saved = resume and checkpoint.latest_step(run_dir) is not None
+  saved = resume and checkpoint_reader.latest_step(run_dir) is not None
   if saved:
-    checkpoint.check(run_dir, None, config=config)
+    checkpoint_reader.check(run_dir, None, config=config)
   env = make_env(config.env, mesh, instants=config.agent.lstm_instants)
   agent = make_agent(config.agent)
   example = example_state(config, env, agent)

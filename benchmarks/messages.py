@@ -20,11 +20,12 @@ import apnpql_jax  # noqa: F401  isort: skip  (before JAX: sets threads and cach
 import jax
 import tables
 
-from apnpql_jax import leaves, sharding
+from apnpql_jax import sharding
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config.files import load_preset
 from apnpql_jax.env import make_env
 from apnpql_jax.iteration import TrainState, example_state, make_sample, place
+from apnpql_jax.runs import leaves
 
 _KINDS = "all-reduce|all-gather|all-to-all|collective-permute|reduce-scatter"
 _BYTES = {"pred": 1, "s8": 1, "u8": 1, "s32": 4, "u32": 4, "f32": 4}

@@ -33,7 +33,8 @@ import damage
 import numpy as np
 import tiny
 
-from apnpql_jax import checkpoint, errors
+from apnpql_jax import errors
+from apnpql_jax.runs import checkpoint_reader
 
 RESULTS = Path(__file__).resolve().parent / "results"
 INTERVAL = 512
@@ -64,7 +65,7 @@ class Trial:
   def disturb(self, fault: str) -> dict[str, Any]:
     """Trains for some seconds, does something, and tells what came of it."""
     run, target = self.run, self.run
-    before = checkpoint.latest_step(run) or 0
+    before = checkpoint_reader.latest_step(run) or 0
     if fault.startswith("poisoned"):
       target = run.with_name("poisoned")
       shutil.copytree(run, target)
@@ -74,8 +75,8 @@ class Trial:
     code = self._end(process, fault)
     row = {"fault": fault, "exit": code, "from": before, "to": reached(target)}
     if target is run:
-      row["lost"] = row["to"] - (checkpoint.latest_step(run) or 0)
-      if fault == "bit flip" and len(checkpoint.all_steps(run)) > 1:
+      row["lost"] = row["to"] - (checkpoint_reader.latest_step(run) or 0)
+      if fault == "bit flip" and len(checkpoint_reader.all_steps(run)) > 1:
         row["file"] = damage.flip_a_bit(run, self._rng)
     else:
       faults = [r for r in tiny.rows(target) if r["step"] > before]

@@ -25,7 +25,7 @@ import tables
 import timing
 import tiny
 
-from apnpql_jax.metrics import MetricWriter
+from apnpql_jax.runs.metrics import MetricWriter
 
 PEAK = {"flops_per_s": 2e9, "bytes_per_s": 1e9}
 MACHINE = {

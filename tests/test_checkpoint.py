@@ -22,11 +22,12 @@ import numpy as np
 import optax
 import pytest
 
-from apnpql_jax import checkpoint, checkpoint_record, resuming
-from apnpql_jax.checkpoint_writer import CheckpointWriter, SaveError
+from apnpql_jax import resuming
 from apnpql_jax.config.files import config_to_json
 from apnpql_jax.config.schema import AgentConfig, TrainConfig
 from apnpql_jax.errors import ConfigError
+from apnpql_jax.runs import checkpoint_reader, checkpoint_record
+from apnpql_jax.runs.checkpoint_writer import CheckpointWriter, SaveError
 
 CONFIG = TrainConfig()
 
@@ -84,7 +85,7 @@ def _assert_same_bits(a: Any, b: Any) -> None:
 
 def _restore(run: Path, step: int | None, example: Any, **settings: Any) -> Any:
   examples = {"state": example}
-  return checkpoint.restore(run, step, examples, **settings).items["state"]
+  return checkpoint_reader.restore(run, step, examples, **settings).items["state"]
 
 
 def _save(run: Path, *states: tuple[int, State, float | None], keep: int = 9) -> None:
@@ -130,12 +131,12 @@ def test_donating_a_state_while_it_is_saved_does_not_change_the_file(tmp_path: P
 def test_newest_and_best_are_kept(tmp_path: Path):
   rates = {1: 0.2, 2: 0.9, 3: 0.9, 4: 0.1, 5: None, 6: 0.3}
   _save(tmp_path, *((s, _state(s), r) for s, r in rates.items()), keep=2)
-  assert checkpoint.all_steps(tmp_path) == [3, 5, 6]
-  assert checkpoint.latest_step(tmp_path) == 6
-  assert checkpoint.best_step(tmp_path) == 3
+  assert checkpoint_reader.all_steps(tmp_path) == [3, 5, 6]
+  assert checkpoint_reader.latest_step(tmp_path) == 6
+  assert checkpoint_reader.best_step(tmp_path) == 3
   # A writer opened later still knows which was best.
   _save(tmp_path, (7, _state(7), 0.5), (8, _state(8), None), keep=2)
-  assert checkpoint.all_steps(tmp_path) == [3, 7, 8]
+  assert checkpoint_reader.all_steps(tmp_path) == [3, 7, 8]
   _assert_same_bits(_restore(tmp_path, 3, _state()), _state(3))
 
 
@@ -151,7 +152,7 @@ def test_resuming_from_an_earlier_step_loses_nothing(tmp_path: Path):
   (tmp_path / "metrics.jsonl").write_text('{"step": 30}\n')
   assert resuming.set_aside(tmp_path, 30) is None
   aside = resuming.set_aside(tmp_path, 10)
-  assert checkpoint.all_steps(tmp_path) == [10] and aside is not None
+  assert checkpoint_reader.all_steps(tmp_path) == [10] and aside is not None
   assert (aside / "metrics.jsonl").read_text() == '{"step": 30}\n'
   # They can be put back as they were; a second resume keeps only what it finds.
   _save(tmp_path, (20, _state(21), None))
@@ -214,7 +215,7 @@ def test_other_leaves_are_refused_by_name(tmp_path: Path):
 
 
 def test_missing_and_broken_checkpoints_are_refused_in_one_line(tmp_path: Path):
-  assert checkpoint.latest_step(tmp_path) is None
+  assert checkpoint_reader.latest_step(tmp_path) is None
   with pytest.raises(ConfigError, match="has no checkpoint"):
     _restore(tmp_path, None, _state())
   _save(tmp_path, (1, _state(1), None), (2, _state(2), None))
@@ -227,7 +228,7 @@ def test_missing_and_broken_checkpoints_are_refused_in_one_line(tmp_path: Path):
   assert "\n" not in str(error.value)
   # What was cut off while being written is not taken for a checkpoint.
   (folder / "9.orbax-checkpoint-tmp").mkdir()
-  assert checkpoint.all_steps(tmp_path) == [1, 2]
+  assert checkpoint_reader.all_steps(tmp_path) == [1, 2]
   _assert_same_bits(_restore(tmp_path, 1, _state()), _state(1))
 
 
@@ -244,11 +245,13 @@ def test_items_are_read_one_by_one_and_older_ones_fill_in(tmp_path: Path):
       items = {"small": _state(step)} | ({"large": _state(9)} if step == 2 else {})
       writer.save(step, items)
   # The newest is kept, and the one that holds what it lacks.
-  assert checkpoint.all_steps(tmp_path) == [2, 4]
-  found = checkpoint.restore(tmp_path, None, {"small": _state(), "large": _state()})
+  assert checkpoint_reader.all_steps(tmp_path) == [2, 4]
+  found = checkpoint_reader.restore(
+    tmp_path, None, {"small": _state(), "large": _state()}
+  )
   assert found.step == 4 and found.steps == {"small": 4, "large": 2}
   _assert_same_bits(found.items, {"small": _state(4), "large": _state(9)})
-  found = checkpoint.restore(tmp_path, 2, {"small": _state()})
+  found = checkpoint_reader.restore(tmp_path, 2, {"small": _state()})
   assert found.items.keys() == {"small"} and found.steps == {"small": 2}
 
 
@@ -278,7 +281,7 @@ def test_damage_is_recognised_named_and_the_one_before_taken(tmp_path: Path, dam
     else:
       data[rng.integers(len(data))] ^= 1 << rng.integers(8)
       (run / file).write_bytes(data)
-    found = checkpoint.restore(run, None, {"state": _state()}, config=CONFIG)
+    found = checkpoint_reader.restore(run, None, {"state": _state()}, config=CONFIG)
     _assert_same_bits(found.items["state"], _state(found.step))
     if found.step == 1:
       (line,) = found.damaged
@@ -287,7 +290,7 @@ def test_damage_is_recognised_named_and_the_one_before_taken(tmp_path: Path, dam
     # It does not keep the run from being written to, either.
     resuming.set_aside(run, found.step)
     CheckpointWriter(run, CONFIG, keep=2).close()
-    assert checkpoint.latest_step(run) == found.step
+    assert checkpoint_reader.latest_step(run) == found.step
     shutil.rmtree(run)
   assert refused == {"meta", "state"}
   gc.collect()  # What Orbax left would complain in another test.
@@ -322,12 +325,12 @@ def test_a_record_that_somebody_wrote_is_refused_in_one_line_or_right(foreign, d
   record["crc32"] = checkpoint_record._checksum(record)
   path.write_text(json.dumps(record))
   try:
-    found = checkpoint.restore(foreign, None, {"state": _state()}, config=CONFIG)
+    found = checkpoint_reader.restore(foreign, None, {"state": _state()}, config=CONFIG)
   except ConfigError as error:
     assert len(str(error)) < 2000
   else:
     _assert_same_bits(found.items["state"], _state(1))
-    checkpoint.best_step(foreign)
+    checkpoint_reader.best_step(foreign)
   finally:
     path.write_text(whole)
 
@@ -366,7 +369,7 @@ def test_a_full_disk_leaves_the_checkpoints_before_untouched(tmp_path: Path):
     writer.save(3, {"state": _state(3)})
     figures = writer.finished(wait=True)
   assert figures["checkpoint/mib"] > 0 and figures["checkpoint/wall_s"] > 0
-  assert checkpoint.all_steps(tmp_path) == [3]
+  assert checkpoint_reader.all_steps(tmp_path) == [3]
 
 
 SAVE_FOR_EVER = """
@@ -400,8 +403,10 @@ def test_a_process_killed_while_it_saves_loses_one_save_at_most(tmp_path, moment
       time.sleep(rng.uniform(0.0, 0.6))
       process.kill()
       said = max([said, *(int(line) for line in process.stdout if line.endswith("\n"))])
-    step = checkpoint.latest_step(tmp_path)
+    step = checkpoint_reader.latest_step(tmp_path)
     assert step is not None and step in (said, said + 1)
-    found = checkpoint.restore(tmp_path, None, {"state": _state(0, images=200_000)})
+    found = checkpoint_reader.restore(
+      tmp_path, None, {"state": _state(0, images=200_000)}
+    )
     assert found.step == step and not found.damaged
     _assert_same_bits(found.items["state"], _state(step % 7, images=200_000))

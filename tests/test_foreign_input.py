@@ -10,11 +10,13 @@ from hypothesis import HealthCheck, example, given, settings, strategies as st
 import numpy as np
 import pytest
 
-from apnpql_jax import npz, run_folder, runs
+import apnpql_jax
+from apnpql_jax import npz
 from apnpql_jax.config.codec import flatten
 from apnpql_jax.config.files import config_from_json, config_to_json
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import ConfigError
+from apnpql_jax.runs import run_folder
 
 NUMBERS = st.one_of(
   st.integers(), st.floats(), st.sampled_from([0, -1, 1, 2**31, 2**63, 10**400])
@@ -137,12 +139,12 @@ def test_a_configuration_of_gigabytes_is_not_read(tmp_path: Path):
   with (run / "config.json").open("r+b") as file:
     file.truncate(8 << 30)  # Sparse: it takes no room on the disk.
   with pytest.raises(ConfigError, match="more than 1048576 bytes"):
-    runs.load_run_config(run)
+    run_folder.load_run_config(run)
 
 
 def test_no_module_can_run_what_a_file_says():
   """pickle, and what is made of it, is imported nowhere; NumPy is told so each time."""
-  package = Path(runs.__file__).parent
+  package = Path(apnpql_jax.__file__).parent
   words = ("import pickle", "import dill", "import shelve", "import joblib", "marshal")
   for path in package.rglob("*.py"):
     text = path.read_text(encoding="utf-8")

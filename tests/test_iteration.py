@@ -17,19 +17,9 @@ import numpy as np
 import pytest
 import tiny
 
-from apnpql_jax import (
-  checkpoint,
-  cli,
-  errors,
-  faults,
-  leaves,
-  replay,
-  resuming,
-  run_folder,
-)
+from apnpql_jax import cli, errors, faults, replay, resuming
 from apnpql_jax.agents.algorithms import ALGORITHMS
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.checkpoint_writer import CheckpointWriter
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.env import Env, make_env
 from apnpql_jax.errors import ConfigError
@@ -41,6 +31,8 @@ from apnpql_jax.iteration import (
   make_iteration,
   make_sample,
 )
+from apnpql_jax.runs import checkpoint_reader, leaves, run_folder
+from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
 
 WORLDS, LENGTH = tiny.CONFIG.env.worlds, tiny.CONFIG.rollout_length
 
@@ -211,7 +203,7 @@ def test_without_its_replay_a_state_goes_on_with_an_older_one(
 ):
   before, after = built.state, iteration(built.state)[0]
   _save(tmp_path, built, (before, True), (after, False))
-  assert checkpoint.all_steps(tmp_path) == [24, 32]
+  assert checkpoint_reader.all_steps(tmp_path) == [24, 32]
   example = jax.eval_shape(lambda: jax.tree.map(jnp.copy, after))
   said: list[str] = []
   restored = resuming.restore(built.config, tmp_path, example, said.append)

@@ -20,10 +20,10 @@ import pytest
 from scipy import stats
 from tensorboardX.proto import event_pb2
 
-from apnpql_jax import metrics
 from apnpql_jax.errors import ConfigError
-from apnpql_jax.extra_sinks import check_sinks, make_sinks
-from apnpql_jax.progress import TrainProgress
+from apnpql_jax.runs import metrics
+from apnpql_jax.runs.progress import TrainProgress
+from apnpql_jax.runs.sinks import check_sinks, make_sinks
 
 
 class Clock:

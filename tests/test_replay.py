@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from apnpql_jax import leaves, memory, replay as rb
+from apnpql_jax import memory, replay as rb
 from apnpql_jax.errors import ConfigError
+from apnpql_jax.runs import leaves
 from apnpql_jax.types import Observation, Slot, TimeStep, Transition
 
 GAMMA = 0.9

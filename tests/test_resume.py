@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import tiny
 
-from apnpql_jax import checkpoint
+from apnpql_jax.runs import checkpoint_reader
 
 PATIENCE_S = 900
 FOR_EVER = ("--total-steps", "100000")
@@ -60,7 +60,7 @@ def test_a_run_killed_at_random_moments_ends_as_if_nothing_had_been(tmp_path, ki
     time.sleep(rng.uniform(0.0, 3.0))
     process.kill()
     process.wait()
-    reached, saved = tiny.rows(run)[-1]["step"], checkpoint.latest_step(run) or 0
+    reached, saved = tiny.rows(run)[-1]["step"], checkpoint_reader.latest_step(run) or 0
     lost.append(reached - saved)
     saving += any((run / "checkpoints").glob("*tmp*"))
     print(f"lost {lost[-1]} of {reached}", flush=True)
@@ -74,7 +74,7 @@ def test_a_run_killed_at_random_moments_ends_as_if_nothing_had_been(tmp_path, ki
   _wait(process, said)
   process.terminate()
   assert process.wait(PATIENCE_S) == 128 + signal.SIGTERM
-  stopped = checkpoint.latest_step(run)
+  stopped = checkpoint_reader.latest_step(run)
   assert f"saved at step {stopped:,}; to go on: --resume {run}" in said.read_text()
 
   # Evaluations are none of the training's business.

@@ -12,9 +12,10 @@ import sys
 import jax
 import pytest
 
-from apnpql_jax import run_folder
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.errors import ConfigError
+from apnpql_jax.runs import run_folder, text, versions
+from apnpql_jax.runs.versions import changed_versions
 
 CONFIG = TrainConfig(env=EnvConfig(worlds=64), seed=3)
 
@@ -47,29 +48,29 @@ def test_git_commit_is_that_of_the_package_and_of_nobody_else(tmp_path: Path):
   package = tmp_path / "package"
   package.mkdir()
   (package / "__init__.py").write_text("a = 1\n")
-  assert run_folder._git(package) is None
+  assert versions._git(package) is None
   git("init", "-q")
   # Installed inside a repository that does not track it.
   git("commit", "-q", "--allow-empty", "-m", "other")
-  assert run_folder._git(package) is None
+  assert versions._git(package) is None
   git("add", "package")
   git("commit", "-q", "-m", "mine")
   commit = git("rev-parse", "HEAD")
-  assert run_folder._git(package) == {"commit": commit, "dirty": False}
+  assert versions._git(package) == {"commit": commit, "dirty": False}
   (package / "__init__.py").write_text("a = 2\n")
-  assert run_folder._git(package) == {"commit": commit, "dirty": True}
+  assert versions._git(package) == {"commit": commit, "dirty": True}
 
 
 def test_changed_versions_are_listed(tmp_path: Path):
   folder = run_folder.create(tmp_path / "run", CONFIG)
-  assert run_folder.changed_versions(folder) == []
+  assert changed_versions(folder.versions) == []
   versions = json.loads(folder.versions.read_text())
   versions["packages"]["jax"] = "0.0.1"
   versions["created"] = "long ago"
   folder.versions.write_text(json.dumps(versions))
-  assert run_folder.changed_versions(folder) == [f"jax 0.0.1 -> {jax.__version__}"]
+  assert changed_versions(folder.versions) == [f"jax 0.0.1 -> {jax.__version__}"]
   folder.versions.write_text("{")
-  assert run_folder.changed_versions(folder) == ["versions.json cannot be read"]
+  assert changed_versions(folder.versions) == ["versions.json cannot be read"]
 
 
 def test_a_run_is_replaced_only_when_asked(tmp_path: Path):
@@ -114,17 +115,17 @@ def test_what_is_no_run_is_not_opened(tmp_path: Path):
 
 def test_a_text_file_is_written_whole_or_not_at_all(tmp_path: Path):
   path = tmp_path / "a.json"
-  run_folder.write_text(path, "old")
+  text.write_text(path, "old")
   with pytest.raises(UnicodeEncodeError):
-    run_folder.write_text(path, "new \ud800")
+    text.write_text(path, "new \ud800")
   assert path.read_text() == "old"
 
 
 def test_the_command_line_loads_none_of_the_heavy_packages():
   heavy = "jax orbax matplotlib rich flax mujoco numpy".split()
   code = (
-    "import sys, apnpql_jax.cli, apnpql_jax.metrics, apnpql_jax.progress,"
-    "apnpql_jax.run_folder, apnpql_jax.extra_sinks, apnpql_jax.memory;"
+    "import sys, apnpql_jax.cli, apnpql_jax.runs.metrics, apnpql_jax.runs.progress,"
+    "apnpql_jax.runs.run_folder, apnpql_jax.runs.sinks, apnpql_jax.memory;"
     f"print([name for name in {heavy} if name in sys.modules])"
   )
   command = [sys.executable, "-c", code]

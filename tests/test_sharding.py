@@ -27,9 +27,8 @@ import numpy as np
 import pytest
 import tiny
 
-from apnpql_jax import checkpoint, cli, leaves, resuming, runs, sharding
+from apnpql_jax import cli, resuming, sharding
 from apnpql_jax.agents.learner import LearnerState, make_agent
-from apnpql_jax.checkpoint_writer import CheckpointWriter
 from apnpql_jax.config.checks import validate
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.env import make_env
@@ -43,6 +42,8 @@ from apnpql_jax.iteration import (
   shardings,
 )
 from apnpql_jax.rollout import agent_policy, rollout
+from apnpql_jax.runs import checkpoint_reader, leaves, run_folder
+from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
 
 DEVICES = 4
 ITERATIONS = 3
@@ -158,7 +159,7 @@ def test_two_processes_learn_what_one_learns_and_stop_together(tmp_path):
 
   pair = start("--total-steps", "1000000")
   deadline = time.monotonic() + PATIENCE_S
-  while 64 not in checkpoint.all_steps(run):
+  while 64 not in checkpoint_reader.all_steps(run):
     assert time.monotonic() < deadline and pair[0].poll() is None, said[0].read_text()
     time.sleep(0.1)
   pair[1].send_signal(signal.SIGTERM)
@@ -166,19 +167,19 @@ def test_two_processes_learn_what_one_learns_and_stop_together(tmp_path):
     assert process.wait(PATIENCE_S) == 128 + signal.SIGTERM, log.read_text()[-4000:]
   rows = [row["step"] for row in tiny.rows(run) if "loss/q" in row]
   assert rows == list(range(8, rows[-1] + 8, 8))
-  assert checkpoint.latest_step(run) == rows[-1]
+  assert checkpoint_reader.latest_step(run) == rows[-1]
 
   assert_same(run, single)
 
 
 def assert_same(run: Path, single: Path) -> None:
   """Both runs have the same parameters after 64 steps, within rounding."""
-  config = runs.load_run_config(run)
+  config = run_folder.load_run_config(run)
   env, agent = make_env(config.env), make_agent(config.agent)
   example = {"learner": example_state(config, env, agent).learner}
 
   def saved(folder: Path, step: int) -> np.ndarray:
-    return _flat(checkpoint.restore(folder, step, example).items["learner"])
+    return _flat(checkpoint_reader.restore(folder, step, example).items["learner"])
 
   end = saved(single, 64)
   way, distance = (np.linalg.norm(end - saved(run, step)) for step in (16, 64))

@@ -11,7 +11,7 @@ import time
 
 import pytest
 
-from apnpql_jax.signals import Signals
+from apnpql_jax.runs.signals import Signals
 
 BUSY = """
 import hashlib, sys

@@ -15,11 +15,11 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from apnpql_jax import checkpoint, run_folder
 from apnpql_jax.config.schema import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.evaluate import evaluate_run
 from apnpql_jax.recording import HOLD
+from apnpql_jax.runs import checkpoint_reader, run_folder
 from apnpql_jax.train import train
 
 CONFIG = TrainConfig(
@@ -59,7 +59,7 @@ def test_a_run_leaves_everything_behind(finished):
   assert np.isfinite(losses).all()
   with (run_dir / "metrics.csv").open() as file:
     assert len(list(csv.DictReader(file))) == len(rows)
-  assert checkpoint.all_steps(run_dir) == [32, 64]
+  assert checkpoint_reader.all_steps(run_dir) == [32, 64]
   assert iio.imread(folder.curve).shape[-1] in (3, 4)
   (video,) = folder.videos.iterdir()
   frames = iio.imread(video)
@@ -121,7 +121,7 @@ def test_ctrl_c_ends_the_run_with_a_checkpoint(tmp_path):
     assert process.wait(timeout=60) == 130
   finally:
     process.kill()
-  (step,) = checkpoint.all_steps(run_dir)
+  (step,) = checkpoint_reader.all_steps(run_dir)
   rows = [json.loads(line) for line in metrics.read_text().splitlines()]
   assert rows[-1]["step"] == step
   assert f"saved at step {step}; to go on: --resume {run_dir}" in said.read_text()

@@ -39,9 +39,9 @@ from apnpql_jax.config.files import (
   load_preset,
 )
 from apnpql_jax.config.schema import TrainConfig
-from apnpql_jax.metrics import read_rows
 from apnpql_jax.options import Train, parse
-from apnpql_jax.run_folder import RunFolder, open_run
+from apnpql_jax.runs.metrics import read_rows
+from apnpql_jax.runs.run_folder import RunFolder, open_run
 
 OUT = Path(__file__).resolve().with_suffix("")
 

@@ -12,18 +12,18 @@ import logging
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from apnpql_jax import checkpoint_record, leaves
-from apnpql_jax.checkpoint_record import (
+from apnpql_jax.config.files import config_diff, config_from_json, format_diff
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.errors import ConfigError
+from apnpql_jax.runs import checkpoint_record, leaves
+from apnpql_jax.runs.checkpoint_record import (
   DamagedError,
   best,
   first_line,
   newest_until,
   title,
 )
-from apnpql_jax.config.files import config_diff, config_from_json, format_diff
-from apnpql_jax.config.schema import TrainConfig
-from apnpql_jax.errors import ConfigError
-from apnpql_jax.runs import MAY_CHANGE
+from apnpql_jax.runs.run_folder import MAY_CHANGE
 
 all_steps = checkpoint_record.steps
 

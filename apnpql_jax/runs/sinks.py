@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from apnpql_jax.errors import ConfigError, check_name
-from apnpql_jax.metrics import Sink
+from apnpql_jax.runs.metrics import Sink
 
 
 class TensorboardSink:

@@ -12,9 +12,9 @@ import shutil
 import time
 from typing import Any
 
-from apnpql_jax import checkpoint_record, leaves
-from apnpql_jax.checkpoint_record import best, first_line, newest_until
 from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.runs import checkpoint_record, leaves
+from apnpql_jax.runs.checkpoint_record import best, first_line, newest_until
 
 _CHUNK_BYTES = 16 << 20
 """Unit of compression: a replay as one chunk took one core twice as long."""

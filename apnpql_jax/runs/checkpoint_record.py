@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 import zlib
 
-from apnpql_jax import leaves, runs
 from apnpql_jax.config.files import config_to_json
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import ConfigError
+from apnpql_jax.runs import leaves, text
 
 SCHEMA_VERSION = 2
 """Raised whenever what the code expects in a checkpoint changes."""
@@ -75,7 +75,7 @@ def read(run_dir: Path, step: int) -> Record:
   path = folder(run_dir) / str(step) / "meta" / "metadata"
   name = title(run_dir, step)
   try:
-    record = json.loads(runs.read_small(path, _MAX_BYTES))
+    record = json.loads(text.read_text(path, _MAX_BYTES))
     version, crc32 = record["schema_version"], record.pop("crc32", None)
     whole = crc32 == _checksum(record)
     if version != SCHEMA_VERSION and (whole or crc32 is None):

@@ -13,7 +13,7 @@ import time
 from typing import Any, Protocol
 
 from apnpql_jax.errors import ConfigError
-from apnpql_jax.run_folder import write_text
+from apnpql_jax.runs.text import write_text
 
 STEP = "step"
 """Environment steps, summed over worlds; the first column of every row."""

@@ -10,10 +10,10 @@ import sys
 
 import pytest
 
-from apnpql_jax import runs
 from apnpql_jax.config.files import config_to_json
 from apnpql_jax.config.schema import AgentConfig, TrainConfig
 from apnpql_jax.errors import ConfigError
+from apnpql_jax.runs import run_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -26,15 +26,15 @@ def write_run(folder: Path, config: TrainConfig | None = None) -> Path:
 
 
 def test_new_run_dir_takes_the_first_free_number(tmp_path):
-  assert runs.new_run_dir("push_plate", tmp_path) == tmp_path / "push_plate-1"
+  assert run_folder.new_run_dir("push_plate", tmp_path) == tmp_path / "push_plate-1"
   (tmp_path / "push_plate-1").mkdir()
   (tmp_path / "push_plate-3").mkdir()
-  assert runs.new_run_dir("push_plate", tmp_path) == tmp_path / "push_plate-2"
+  assert run_folder.new_run_dir("push_plate", tmp_path) == tmp_path / "push_plate-2"
 
 
 def test_configuration_of_a_run_is_read_back(tmp_path):
   config = TrainConfig(seed=3, agent=AgentConfig(gamma=0.9))
-  assert runs.load_run_config(write_run(tmp_path / "a", config)) == config
+  assert run_folder.load_run_config(write_run(tmp_path / "a", config)) == config
 
 
 def test_a_run_made_before_a_setting_came_is_read_and_that_is_said(tmp_path):
@@ -44,56 +44,56 @@ def test_a_run_made_before_a_setting_came_is_read_and_that_is_said(tmp_path):
   del data["agent"]["residual_blocks"]
   (run / "config.json").write_text(json.dumps(data))
   said: list[str] = []
-  assert runs.load_run_config(run, said.append) == config
+  assert run_folder.load_run_config(run, said.append) == config
   assert said == [
     f"{run}/config.json is older than some settings, which are as before: "
     "agent.residual_blocks 0"
   ]
   # It is resumed as it was, and only so.
-  runs.check_resumable(run, config)
+  run_folder.check_resumable(run, config)
   blocks = dataclasses.replace(config.agent, residual_blocks=1)
   with pytest.raises(ConfigError, match="agent.residual_blocks 0 -> 1"):
-    runs.check_resumable(run, dataclasses.replace(config, agent=blocks))
+    run_folder.check_resumable(run, dataclasses.replace(config, agent=blocks))
   del data["agent"]["n_step"]
   (run / "config.json").write_text(json.dumps(data))
   with pytest.raises(ConfigError, match="config.json: .*'agent.n_step' is missing"):
-    runs.load_run_config(run, pytest.fail)
+    run_folder.load_run_config(run, pytest.fail)
 
 
 def test_configuration_that_is_not_text_is_refused(tmp_path):
   write_run(tmp_path / "a")
   (tmp_path / "a" / "config.json").write_bytes(b"\xff\xfe\x00")
   with pytest.raises(ConfigError, match="config.json"):
-    runs.load_run_config(tmp_path / "a")
+    run_folder.load_run_config(tmp_path / "a")
 
 
 def test_resume_may_change_only_what_does_not_alter_learning(tmp_path):
   run = write_run(tmp_path / "a")
-  for name in runs.MAY_CHANGE:
+  for name in run_folder.MAY_CHANGE:
     value = getattr(TrainConfig(), name)
     other = {bool: lambda x: not x, int: lambda x: x + 1, tuple: lambda x: (*x, "a")}
     other = other[type(value)](value)
-    runs.check_resumable(run, dataclasses.replace(TrainConfig(), **{name: other}))
-  fixed = {f.name for f in dataclasses.fields(TrainConfig)} - set(runs.MAY_CHANGE)
+    run_folder.check_resumable(run, dataclasses.replace(TrainConfig(), **{name: other}))
+  fixed = {f.name for f in dataclasses.fields(TrainConfig)} - set(run_folder.MAY_CHANGE)
   for name in fixed - {"env", "agent", "replay"}:
     changed = {name: getattr(TrainConfig(), name) + 1}
     with pytest.raises(ConfigError, match=name):
-      runs.check_resumable(run, dataclasses.replace(TrainConfig(), **changed))
+      run_folder.check_resumable(run, dataclasses.replace(TrainConfig(), **changed))
 
 
 def test_a_run_that_is_trained_is_left_alone(tmp_path):
   run, other = write_run(tmp_path / "run"), write_run(tmp_path / "other")
-  with runs.alone(run), runs.alone(other):
+  with run_folder.lock(run), run_folder.lock(other):
     for refused in (
-      lambda: runs.check_resumable(run, TrainConfig()),
-      lambda: runs.check_free(run, overwrite=True),
-      lambda: runs.alone(run).__enter__(),
+      lambda: run_folder.check_resumable(run, TrainConfig()),
+      lambda: run_folder.check_free(run, overwrite=True),
+      lambda: run_folder.lock(run).__enter__(),
     ):
       with pytest.raises(ConfigError, match="run' is trained by another process"):
         refused()
-    runs.load_run_config(run)
-  runs.check_resumable(run, TrainConfig())
-  runs.check_free(run, overwrite=True)
+    run_folder.load_run_config(run)
+  run_folder.check_resumable(run, TrainConfig())
+  run_folder.check_free(run, overwrite=True)
   # A process that is killed lets go of it.
   code = "import sys, pathlib, time; from apnpql_jax import runs\n"
   code += (
@@ -103,29 +103,29 @@ def test_a_run_that_is_trained_is_left_alone(tmp_path):
   with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as process:
     assert process.stdout is not None and process.stdout.readline()
     with pytest.raises(ConfigError, match="another process"):
-      runs.check_free(run, overwrite=True)
+      run_folder.check_free(run, overwrite=True)
     process.kill()
-  runs.check_free(run, overwrite=True)
+  run_folder.check_free(run, overwrite=True)
 
 
 def test_only_a_run_can_be_overwritten(tmp_path):
-  runs.check_free(tmp_path / "new", overwrite=False)
+  run_folder.check_free(tmp_path / "new", overwrite=False)
   (tmp_path / "empty").mkdir()
-  runs.check_free(tmp_path / "empty", overwrite=False)
+  run_folder.check_free(tmp_path / "empty", overwrite=False)
   run = write_run(tmp_path / "run")
-  runs.check_free(run, overwrite=True)
+  run_folder.check_free(run, overwrite=True)
   with pytest.raises(ConfigError, match="--overwrite"):
-    runs.check_free(run, overwrite=False)
+    run_folder.check_free(run, overwrite=False)
   (tmp_path / "link").symlink_to(run, target_is_directory=True)
   (run / "config.json").rename(tmp_path / "elsewhere.json")
   for folder in (run, tmp_path, tmp_path / "link", tmp_path / "elsewhere.json"):
     with pytest.raises(ConfigError):
-      runs.check_free(folder, overwrite=True)
+      run_folder.check_free(folder, overwrite=True)
 
 
 def test_fresh_folder_replaces_the_old_run(tmp_path):
   run = write_run(tmp_path / "run")
-  with runs.fresh_run_dir(run) as folder:
+  with run_folder.fresh_run_dir(run) as folder:
     assert folder == run
     assert list(folder.iterdir()) == []
     (folder / "config.json").write_text("new")
@@ -141,7 +141,7 @@ def test_refused_run_leaves_everything_as_it_was(tmp_path, error, begun, existed
   run = tmp_path / "run"
   if existed:
     write_run(run)
-  with pytest.raises(error), runs.fresh_run_dir(run) as folder:
+  with pytest.raises(error), run_folder.fresh_run_dir(run) as folder:
     (folder / "scene.bin").write_bytes(b"new")
     if begun:
       (folder / "config.json").write_text("new")
@@ -155,7 +155,7 @@ def test_refused_run_leaves_everything_as_it_was(tmp_path, error, begun, existed
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, SystemExit, RuntimeError])
 def test_stopped_run_is_kept_and_the_old_one_removed(tmp_path, stop):
   run = write_run(tmp_path / "run")
-  with pytest.raises(stop), runs.fresh_run_dir(run) as folder:
+  with pytest.raises(stop), run_folder.fresh_run_dir(run) as folder:
     (folder / "config.json").write_text("new")
     raise stop()
   assert [path.name for path in tmp_path.iterdir()] == ["run"]
@@ -166,6 +166,6 @@ def test_folder_that_cannot_be_made_is_refused(tmp_path):
   (tmp_path / "file").write_text("")
   with (
     pytest.raises(ConfigError, match="cannot make run folder"),
-    runs.fresh_run_dir(tmp_path / "file" / "run"),
+    run_folder.fresh_run_dir(tmp_path / "file" / "run"),
   ):
     pass

@@ -1,18 +1,27 @@
-"""Run folders: naming a new one, reading an old one, never overwriting by accident."""
+"""Run folders: naming, creating, locking and reading them without accidental loss."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
 import contextlib
+import dataclasses
 import fcntl
+import json
 import os
 from pathlib import Path
 import shutil
 
 from apnpql_jax.config import codec
-from apnpql_jax.config.files import config_diff, config_from_json, format_diff
+from apnpql_jax.config.files import (
+  config_diff,
+  config_from_json,
+  config_to_json,
+  format_diff,
+)
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import ConfigError
+from apnpql_jax.runs.text import read_text, write_text
+from apnpql_jax.runs.versions import describe_versions
 
 CONFIG_FILE = "config.json"
 """Its presence makes a folder a run folder."""
@@ -32,6 +41,72 @@ MAY_CHANGE = (
 )
 """Settings that a resumed run may change: none of them alters what is learned from a
 given state of the run."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RunFolder:
+  """Paths of one run; the folder exists and holds ``config.json``."""
+
+  path: Path
+  """The folder itself."""
+
+  config: TrainConfig
+  """The configuration the run was started with."""
+
+  @property
+  def versions(self) -> Path:
+    """What the run was made with, see ``describe_versions``."""
+    return self.path / "versions.json"
+
+  @property
+  def metrics_jsonl(self) -> Path:
+    """Metrics, one JSON object per line."""
+    return self.path / "metrics.jsonl"
+
+  @property
+  def curve(self) -> Path:
+    """Success rate over steps and time."""
+    return self.path / "curve.png"
+
+  @property
+  def videos(self) -> Path:
+    """Folder of evaluation videos; made by whoever writes the first one."""
+    return self.path / "videos"
+
+  @property
+  def faults(self) -> Path:
+    """Folder of updates that were not finite, see ``faults``."""
+    return self.path / "faults"
+
+
+def create(
+  run_dir: Path, config: TrainConfig, *, overwrite: bool = False, devices: int = 1
+) -> RunFolder:
+  """Makes the folder and writes ``config.json`` and ``versions.json`` into it.
+
+  Raises:
+    ConfigError: it holds a run and ``overwrite`` is not set, or something that is no
+      run, which is never removed; or it cannot be made.
+  """
+  check_free(run_dir, overwrite=overwrite)
+  versions = json.dumps(describe_versions(devices), indent=2) + "\n"
+  with fresh_run_dir(run_dir) as path:
+    folder = RunFolder(path=path, config=config)
+    write_text(folder.versions, versions)
+    # Last, because its presence says that this is a run.
+    write_text(path / CONFIG_FILE, config_to_json(config))
+  return folder
+
+
+def open_run(run_dir: Path) -> RunFolder:
+  """An existing run, to resume or to evaluate.
+
+  Raises:
+    ConfigError: it is not a run folder, its configuration cannot be read, or links
+      lead out of it.
+  """
+  check_contained(run_dir)
+  return RunFolder(path=run_dir.absolute(), config=load_run_config(run_dir))
 
 
 def new_run_dir(preset: str, root: Path = Path("runs")) -> Path:
@@ -61,25 +136,12 @@ def load_run_config(
       f"{_nearby_runs(run_dir)}"
     )
   try:
-    text = read_small(path, _MAX_CONFIG_BYTES)
+    text = read_text(path, _MAX_CONFIG_BYTES)
     return config_from_json(text, lambda line: say(f"{path} is {line}"))
   except ConfigError as error:
     raise ConfigError(f"{path}: {error}") from None
   except (OSError, ValueError) as error:
     raise ConfigError(f"{path} cannot be read: {error}") from None
-
-
-def read_small(path: Path, limit: int) -> str:
-  """The text of a file that other people may have made.
-
-  Raises:
-    ValueError: it has more than ``limit`` bytes, or is not UTF-8.
-  """
-  with path.open("rb") as file:
-    data = file.read(limit + 1)
-  if len(data) > limit:
-    raise ValueError(f"more than {limit} bytes")
-  return data.decode("utf-8")
 
 
 def check_contained(run_dir: Path) -> None:
@@ -114,12 +176,12 @@ def check_resumable(run_dir: Path, wanted: TrainConfig) -> None:
 
 
 @contextlib.contextmanager
-def alone(run_dir: Path, *, lock: int = fcntl.LOCK_EX) -> Generator[None, None, None]:
-  """Keeps other processes from training in the folder; a killed one lets go of it.
+def lock(run_dir: Path, *, shared: bool = False) -> Generator[None, None, None]:
+  """Holds an exclusive lock on the folder; the OS releases it if the process dies.
 
   Args:
     run_dir: the run folder.
-    lock: a shared one only looks whether there is somebody.
+    shared: take a shared lock, which fails if another process holds the exclusive one.
 
   Raises:
     ConfigError: another process trains there.
@@ -127,10 +189,11 @@ def alone(run_dir: Path, *, lock: int = fcntl.LOCK_EX) -> Generator[None, None, 
   folder = os.open(run_dir, os.O_RDONLY)
   try:
     try:
-      fcntl.flock(folder, lock | fcntl.LOCK_NB)
+      kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+      fcntl.flock(folder, kind | fcntl.LOCK_NB)
     except BlockingIOError:
       raise ConfigError(f"{str(run_dir)!r} is trained by another process") from None
-    except OSError:  # Not every file system has locks.
+    except OSError:  # Some file systems have no locks.
       pass
     yield
   finally:
@@ -138,7 +201,7 @@ def alone(run_dir: Path, *, lock: int = fcntl.LOCK_EX) -> Generator[None, None, 
 
 
 def _check_idle(run_dir: Path) -> None:
-  with alone(run_dir, lock=fcntl.LOCK_SH):
+  with lock(run_dir, shared=True):
     pass
 
 
