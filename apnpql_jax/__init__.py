@@ -22,17 +22,17 @@ if TYPE_CHECKING:
     ReplayConfig as ReplayConfig,
     TrainConfig as TrainConfig,
   )
-  from apnpql_jax.env import Env as Env, make_env as make_env
+  from apnpql_jax.envs.env import Env as Env, make_env as make_env
   from apnpql_jax.errors import ConfigError as ConfigError, UserError as UserError
-  from apnpql_jax.evaluate import evaluate_run as evaluate_run
   from apnpql_jax.runtime import configure as configure
   from apnpql_jax.tasks.task import (
     Task as Task,
     make_task as make_task,
-    register as register,
+    register_task as register_task,
     task_names as task_names,
   )
-  from apnpql_jax.train import train as train
+  from apnpql_jax.training.evaluate import evaluate as evaluate
+  from apnpql_jax.training.train import train as train
 
 from apnpql_jax import runtime
 

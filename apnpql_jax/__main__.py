@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from apnpql_jax.cli import main
+from apnpql_jax.cli.main import main
 
 if __name__ == "__main__":
   sys.exit(main())

@@ -31,7 +31,7 @@ import tiny
 
 from apnpql_jax.config.checks import BACKENDS
 from apnpql_jax.config.files import load_preset
-from apnpql_jax.primitives.bank import load_bank
+from apnpql_jax.primitives.reset_bank import load_bank
 from apnpql_jax.tasks import make_task, task_names
 
 PERIODS = 8
@@ -116,7 +116,9 @@ def import_seconds() -> float:
   """Of a process that only imports what training needs."""
   began = time.monotonic()
   subprocess.run(
-    [sys.executable, "-c", "import apnpql_jax.train"], env=environment(), check=True
+    [sys.executable, "-c", "import apnpql_jax.training.train"],
+    env=environment(),
+    check=True,
   )
   return time.monotonic() - began
 

@@ -14,12 +14,13 @@ import apnpql_jax  # noqa: F401  isort: skip  (before JAX: sets threads and cach
 import jax
 import jax.numpy as jnp
 
-from apnpql_jax import resuming
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.env import make_env
-from apnpql_jax.iteration import empty_expert, initial_state
+from apnpql_jax.envs.env import make_env
 from apnpql_jax.runs import checkpoint_reader
 from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
+from apnpql_jax.training import resume
+from apnpql_jax.training.expert import empty_expert
+from apnpql_jax.training.state import initial_state
 
 
 def poison(run: Path, *, rewards: bool) -> None:
@@ -32,7 +33,7 @@ def poison(run: Path, *, rewards: bool) -> None:
   config = run_folder.load_run_config(run)
   env, agent = make_env(config.env), make_agent(config.agent)
   example = jax.eval_shape(lambda: initial_state(config, env, agent, empty_expert))
-  state = resuming.restore(config, run, example, lambda line: None)
+  state = resume.restore(config, run, example, lambda line: None)
   if rewards:
     state = state.replace(
       replay=_no_rewards(state.replay), expert_replay=_no_rewards(state.expert_replay)
@@ -43,7 +44,7 @@ def poison(run: Path, *, rewards: bool) -> None:
     state = state.replace(env=state.env.replace(physics=physics))
   shutil.rmtree(run / "checkpoints")
   with CheckpointWriter(run, config, keep=1) as writer:
-    writer.save(int(state.env_steps), resuming.to_items(state, whole=True))
+    writer.save(int(state.env_steps), resume.to_items(state, whole=True))
 
 
 def flip_a_bit(run: Path, rng: random.Random) -> str:

@@ -30,8 +30,9 @@ import tables
 import tiny
 
 from apnpql_jax.agents import learner
+from apnpql_jax.agents.heads import Heads, Networks, Params
 from apnpql_jax.agents.learner import Agent, make_agent
-from apnpql_jax.agents.networks import Heads, Networks, Params, make_networks
+from apnpql_jax.agents.networks import make_networks
 from apnpql_jax.config.files import load_preset
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.types import Array, Observation, Transition
@@ -150,7 +151,7 @@ def forgetful_agent(config: AgentConfig) -> Agent:
 
   def build(*args: Any) -> ForgetfulNetworks:
     networks = make_networks(*args)
-    return ForgetfulNetworks(networks.modules, networks.evaluation, networks.config)
+    return ForgetfulNetworks(networks.modules, networks.value, networks.config)
 
   with mock.patch.object(learner, "make_networks", build):
     return make_agent(config)

@@ -16,9 +16,9 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from apnpql_jax import demonstrations
 from apnpql_jax.config.schema import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
-from apnpql_jax.primitives.bank import load_bank
+from apnpql_jax.data import demonstrations
+from apnpql_jax.primitives.reset_bank import load_bank
 from apnpql_jax.runs import metrics
 from apnpql_jax.tasks import make_task
 

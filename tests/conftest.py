@@ -13,6 +13,7 @@ import pytest
 
 import apnpql_jax  # noqa: F401  (sets threads and the compilation cache)
 from apnpql_jax.sim import physics
+from apnpql_jax.sim.engines import make_physics
 from apnpql_jax.sim.kinematics import Kinematics, make_kinematics
 from apnpql_jax.tasks import Task, make_task
 from apnpql_jax.tasks.task import ResetDraw
@@ -32,7 +33,7 @@ def task() -> Task:
 def engines(task: Task) -> dict[str, Callable]:
   """Engine name -> jitted control period over worlds; compiled once per shape."""
   return {
-    name: jax.jit(physics.make_physics(name, task.scene, substeps=30).step)
+    name: jax.jit(make_physics(name, task.scene, substeps=30).step)
     for name in ("native", "mjx")
   }
 
@@ -67,7 +68,7 @@ def rest(
 ) -> Callable[[physics.PhysicsState], physics.PhysicsState]:
   """1.2 s with the arm at rest and the hand open; C MuJoCo unless a test names MJX."""
   backend = getattr(request, "param", "native")
-  engine = jax.jit(physics.make_physics(backend, task.scene, substeps=240).step)
+  engine = jax.jit(make_physics(backend, task.scene, substeps=240).step)
 
   def step(state: physics.PhysicsState) -> physics.PhysicsState:
     worlds = len(state.qpos)

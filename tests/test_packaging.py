@@ -77,8 +77,9 @@ def test_wheel_holds_scenes_presets_and_the_whole_package(wheel):
 
 def test_wheel_works_from_another_directory(installed, tmp_path):
   code = (
-    "import apnpql_jax; from apnpql_jax import presets; print(apnpql_jax.__file__);"
-    "print(presets.mjcf_path('push_plate')); presets.load_preset('push_plate')"
+    "import apnpql_jax; print(apnpql_jax.__file__);"
+    "from apnpql_jax.config import files;"
+    "print(files.mjcf_path('push_plate')); files.load_preset('push_plate')"
   )
   for line in python(installed, tmp_path, "-c", code).splitlines():
     assert Path(line).is_relative_to(installed)
@@ -98,7 +99,7 @@ def test_scenes_in_the_wheel_compile(installed, tmp_path):
 
 def test_command_is_declared(installed):
   (entry,) = installed.glob("*.dist-info/entry_points.txt")
-  assert "apnpql = apnpql_jax.cli:main" in entry.read_text()
+  assert "apnpql = apnpql_jax.cli.main:main" in entry.read_text()
 
 
 @pytest.mark.parametrize("name", ["requirements.lock", "requirements-dev.lock"])

@@ -60,13 +60,13 @@ def _observation(
 def _image(key: Array, image: Array, *, shift: int, jitter: float) -> Array:
   shift_key, color_key = jax.random.split(key)
   if shift:
-    image = shifted(shift_key, image, shift)
+    image = shift_images(shift_key, image, shift)
   if jitter:
-    image = jittered(color_key, image, jitter)
+    image = jitter_colors(color_key, image, jitter)
   return image
 
 
-def shifted(key: Array, image: Array, most: int) -> Array:
+def shift_images(key: Array, image: Array, most: int) -> Array:
   """Moves images by whole pixels; the border is repeated where nothing is known.
 
   Args:
@@ -84,7 +84,7 @@ def shifted(key: Array, image: Array, most: int) -> Array:
   return jax.vmap(crop)(padded, starts).reshape(image.shape)
 
 
-def jittered(key: Array, image: Array, most: float) -> Array:
+def jitter_colors(key: Array, image: Array, most: float) -> Array:
   """Multiplies each colour channel of each image by a factor of its own.
 
   Args:

@@ -17,7 +17,7 @@ from apnpql_jax.errors import ConfigError, check_name
 BACKENDS = ("auto", "mjx", "native")
 OBSERVATIONS = ("pixels", "state")
 TEMPERATURES = ("state", "shared", "fixed")
-REGULARISERS = ("row", "uniform")
+REGULARIZERS = ("row", "uniform")
 EVALUATIONS = ("row", "categorical", "td0", "retrace", "clipped_double_q")
 PRIOR_MEANS = ("primitives", "learned")
 IMAGE_FEATURES = ("map", "keypoints", "both")
@@ -150,7 +150,7 @@ def _validate_env(env: EnvConfig) -> None:
 
 def _validate_agent(agent: AgentConfig) -> None:
   check_name("agent.temperature", agent.temperature, TEMPERATURES)
-  check_name("agent.regulariser", agent.regulariser, REGULARISERS)
+  check_name("agent.regulariser", agent.regulariser, REGULARIZERS)
   check_name("agent.policy_evaluation", agent.policy_evaluation, EVALUATIONS)
   check_name("agent.prior_mean", agent.prior_mean, PRIOR_MEANS)
   check_name("agent.global_features", agent.global_features, IMAGE_FEATURES)

@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from apnpql_jax.render import intersect, shadow, texture
+from apnpql_jax.render.appearance import FIELDS, Appearance, make_appearance
 from apnpql_jax.render.geoms import CameraSpec, Geoms, Lighting
-from apnpql_jax.render.look import FIELDS, Look, make_look
 
 Array = jax.Array
 
@@ -118,7 +118,7 @@ def _render_one(
   to_camera = cam_xmat[None, :, :]
   center = ((geom_xpos[geoms.ids] - cam_xpos[None])[:, :, None] * to_camera).sum(axis=1)
   axes = (to_camera[..., None] * geom_xmat[geoms.ids][:, :, None, :]).sum(axis=1)
-  look = make_look(geoms, camera, lighting, fields)
+  look = make_appearance(geoms, camera, lighting, fields)
   basis = (look.light[:, :, None] * to_camera).sum(axis=1)
   frames = intersect.prepare(center, axes, look.sizes, basis[2])
 
@@ -179,7 +179,7 @@ def _develop(
 def _cast(
   geoms: Geoms,
   lighting: Lighting,
-  look: Look,
+  look: Appearance,
   frames: intersect.Frames,
   basis: Array,
   near: float,
@@ -215,7 +215,7 @@ def nothing(geoms: Geoms) -> float:
   return len(geoms.ids) + _FULL
 
 
-def _intensity(lighting: Lighting, look: Look, cosine: Array) -> Array:
+def _intensity(lighting: Lighting, look: Appearance, cosine: Array) -> Array:
   """In [0, 255/256]; ``lighting`` documents the formula."""
   lit = jnp.maximum(cosine, -lighting.fill * cosine)
   full = _FULL * (look.ambient + look.diffuse * lit)
@@ -225,7 +225,7 @@ def _intensity(lighting: Lighting, look: Look, cosine: Array) -> Array:
 def _darken(
   geoms: Geoms,
   lighting: Lighting,
-  look: Look,
+  look: Appearance,
   frames: intersect.Frames,
   basis: Array,
   rays: intersect.Rays,

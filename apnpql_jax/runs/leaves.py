@@ -12,7 +12,7 @@ from jax.experimental import multihost_utils
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax import sharding
+from apnpql_jax import devices
 
 _SLAB_BYTES = 64 << 20
 """What is gathered at once has to fit onto one device."""
@@ -63,7 +63,7 @@ def checksums(tree: Any) -> dict[str, int]:
 
   All processes that hold parts of the leaves must ask for them together.
   """
-  sharding.meet()
+  devices.meet()
   return {path: _crc32(_key_data(leaf)) for path, leaf in named(tree).items()}
 
 

@@ -10,12 +10,9 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from flax import struct
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax.config.checks import BACKENDS
-from apnpql_jax.errors import check_name
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
 
@@ -76,24 +73,6 @@ class Physics(Protocol):
       close: f32[worlds], 1 closes the gripper, 0 opens it.
     """
     ...
-
-
-def make_physics(name: str, scene: Scene, *, substeps: int) -> Physics:
-  """Engine ``name``; "auto" takes C MuJoCo on a bare CPU and MJX elsewhere.
-
-  Raises:
-    ConfigError: unknown name.
-  """
-  check_name("backend", name, BACKENDS)
-  if name == "auto":
-    name = "native" if jax.default_backend() == "cpu" else "mjx"
-  if name == "native":
-    from apnpql_jax.sim.native import NativePhysics
-
-    return NativePhysics(scene, substeps=substeps)
-  from apnpql_jax.sim.mjx import MjxPhysics
-
-  return MjxPhysics(scene, substeps=substeps)
 
 
 def initial_state(

@@ -29,8 +29,8 @@ from apnpql_jax.sim import arm
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.tasks import geometry, pinch
-from apnpql_jax.tasks.table import TableTask
-from apnpql_jax.tasks.task import ResetDraw, register
+from apnpql_jax.tasks.base import TableTask
+from apnpql_jax.tasks.task import ResetDraw, register_task
 from apnpql_jax.types import Array
 
 SHAPES = ((8, 0.030, 0.130), (8, 0.037, 0.140), (4, 0.033, 0.150))
@@ -93,7 +93,7 @@ def _edit(shape: tuple[int, float, float]) -> Callable[[mujoco.MjSpec], None]:
   return functools.partial(shape_cup, sides=shape[0], half=shape[1], height=shape[2])
 
 
-@register
+@register_task
 class FlipCup(TableTask):
   """See the module's docstring; implements ``tasks.task.Task``."""
 

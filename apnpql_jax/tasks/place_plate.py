@@ -22,9 +22,9 @@ import numpy as np
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.tasks import geometry
+from apnpql_jax.tasks.base import TableTask
 from apnpql_jax.tasks.pinch import ALIGNED, FUNNEL, Pinch, grip, pick_and_place
-from apnpql_jax.tasks.table import TableTask
-from apnpql_jax.tasks.task import ResetDraw, register
+from apnpql_jax.tasks.task import ResetDraw, register_task
 from apnpql_jax.types import Array
 
 WORKSPACE = ((0.40, 0.52), (-0.22, 0.22))
@@ -72,7 +72,7 @@ CLEAR = 0.05
 where it gripped the plate."""
 
 
-@register
+@register_task
 class PlacePlate(TableTask):
   """See the module's docstring; implements ``tasks.task.Task``."""
 

@@ -23,8 +23,8 @@ import numpy as np
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.tasks import geometry
-from apnpql_jax.tasks.table import TableTask
-from apnpql_jax.tasks.task import ResetDraw, register
+from apnpql_jax.tasks.base import TableTask
+from apnpql_jax.tasks.task import ResetDraw, register_task
 from apnpql_jax.types import Array
 
 WORKSPACE = ((0.36, 0.58), (-0.24, 0.24))
@@ -71,7 +71,7 @@ LOOKAHEAD = 0.07
 """m; longest step of a dragging tool's waypoint."""
 
 
-@register
+@register_task
 class PushPlate(TableTask):
   """See the module's docstring; implements ``tasks.task.Task``."""
 

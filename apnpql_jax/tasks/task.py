@@ -77,7 +77,7 @@ _REGISTRY: dict[str, Callable[[], Task]] = {}
 T = TypeVar("T", bound=Task)
 
 
-def register(task: type[T]) -> type[T]:
+def register_task(task: type[T]) -> type[T]:
   """Class decorator that makes a task known under its ``name``."""
   _REGISTRY[task.name] = task
   return task

@@ -32,6 +32,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from summarize import GOAL
 
+from apnpql_jax.cli.options import Train, parse
 from apnpql_jax.config.files import (
   config_diff,
   config_from_json,
@@ -39,7 +40,6 @@ from apnpql_jax.config.files import (
   load_preset,
 )
 from apnpql_jax.config.schema import TrainConfig
-from apnpql_jax.options import Train, parse
 from apnpql_jax.runs.metrics import read_rows
 from apnpql_jax.runs.run_folder import RunFolder, open_run
 
