@@ -9,6 +9,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from apnpql_jax.version import __version__ as __version__
+
 if TYPE_CHECKING:
   from apnpql_jax.agents.learner import Agent as Agent, make_agent as make_agent
   from apnpql_jax.config.files import (
@@ -34,25 +36,17 @@ if TYPE_CHECKING:
   from apnpql_jax.training.evaluate import evaluate as evaluate
   from apnpql_jax.training.train import train as train
 
-from apnpql_jax import runtime
-
-__version__ = "0.1.0"
-
-# Before anything else of the package: JAX reads these settings once, when its
-# backend starts.
-runtime.configure()
-
 _MODULES = {
   "agents.learner": ("Agent", "make_agent"),
   "config.files": ("load_preset", "preset_names"),
   "config.ranges": ("RandomizationConfig",),
   "config.schema": ("AgentConfig", "EnvConfig", "ReplayConfig", "TrainConfig"),
-  "env": ("Env", "make_env"),
+  "envs.env": ("Env", "make_env"),
   "errors": ("ConfigError", "UserError"),
-  "evaluate": ("evaluate_run",),
+  "training.evaluate": ("evaluate",),
   "runtime": ("configure",),
-  "tasks.task": ("Task", "make_task", "register", "task_names"),
-  "train": ("train",),
+  "tasks.task": ("Task", "make_task", "register_task", "task_names"),
+  "training.train": ("train",),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}
 

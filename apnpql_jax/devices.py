@@ -19,7 +19,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, PartitionSpec
 import numpy as np
 
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import ConfigError, one_line
 
 AXIS = "worlds"
 """The one axis of the mesh; batches are split along it too."""
@@ -48,8 +48,7 @@ def join(coordinator: str, processes: int | None, process: int | None) -> None:
   try:
     jax.distributed.initialize(address, processes, process)
   except (RuntimeError, TypeError, ValueError) as error:
-    text = " ".join(str(error).split())[:200]
-    raise ConfigError(f"--coordinator {coordinator}: {text}") from None
+    raise ConfigError(f"--coordinator {coordinator}: {one_line(error)}") from None
 
 
 def make_mesh(devices: int) -> Mesh | None:

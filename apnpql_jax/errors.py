@@ -19,6 +19,10 @@ class ConfigError(UserError, ValueError):
   """A setting that cannot work; the message says what to write instead."""
 
 
+class FileError(UserError):
+  """A file or folder that cannot be used: damaged, foreign, locked or out of reach."""
+
+
 class RunStopped(Exception):
   """A run that ended before its last step, in order; the one-line message says why."""
 
@@ -26,6 +30,11 @@ class RunStopped(Exception):
     """Keeps the exit code, ``INTERRUPTED`` plus a signal or ``FAILED``."""
     super().__init__(message)
     self.code = code
+
+
+def one_line(error: BaseException) -> str:
+  """Returns the message of an exception as one line of at most 200 characters."""
+  return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def check_name(field: str, value: str, valid: Sequence[str]) -> None:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import apnpql_jax  # noqa: F401  (sets threads and the compilation cache)
+from apnpql_jax import runtime
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.engines import make_physics
 from apnpql_jax.sim.kinematics import Kinematics, make_kinematics
@@ -20,6 +20,7 @@ from apnpql_jax.tasks.task import ResetDraw
 
 # Figures are written to files; no test may need a display.
 os.environ.setdefault("MPLBACKEND", "Agg")
+runtime.configure()
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 import dataclasses
 import os
 from pathlib import Path
-import sys
 from typing import TYPE_CHECKING, Any
 
 from apnpql_jax.cli.options import (
@@ -25,6 +24,7 @@ from apnpql_jax.cli.options import (
 from apnpql_jax.config import files
 from apnpql_jax.config.checks import BACKENDS, validate
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
+from apnpql_jax.console import say
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs import run_folder
 from apnpql_jax.training import expert
@@ -45,7 +45,7 @@ def train(args: Train, argv: Sequence[str]) -> Json:
   if args.preset:
     base = files.load_preset(args.preset)
   else:
-    base = run_folder.load_run_config(args.resume or Path(), _tell)
+    base = run_folder.load_run_config(args.resume or Path(), say)
   # Parsed a second time, now on top of the settings asked for.
   args = parse(Train, "train", argv, default=Train(config=base))
   config = _with_shortcuts(args)
@@ -80,7 +80,7 @@ def evaluate(args: Evaluate, argv: Sequence[str]) -> Json:
   _check_video(args.video)
   if args.backend is not None:
     check_name("backend", args.backend, BACKENDS)
-  run_folder.load_run_config(Path(args.run), _tell)
+  run_folder.load_run_config(Path(args.run), say)
 
   from apnpql_jax.training.evaluate import evaluate as evaluate_run
 
@@ -150,7 +150,7 @@ def repeat(args: Repeat, argv: Sequence[str]) -> Json:
   if not args.file:
     raise ConfigError("repeat needs a file: apnpql repeat RUN/faults/step_<n>.npz")
   path = Path(args.file).absolute()
-  run_folder.load_run_config(path.parent.parent, _tell)
+  run_folder.load_run_config(path.parent.parent, say)
 
   from apnpql_jax.training import faults
 
@@ -222,10 +222,6 @@ def _checkpoint_step(args: Evaluate) -> int | None:
   raise ConfigError(
     f"unknown --checkpoint {args.checkpoint!r}; choose from newest, best, or its steps"
   )
-
-
-def _tell(line: str) -> None:
-  print(line, file=sys.stderr, flush=True)
 
 
 def _check_episodes(episodes: int, seed: int) -> None:

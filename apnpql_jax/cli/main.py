@@ -11,8 +11,7 @@ import signal
 import sys
 from typing import Any
 
-import apnpql_jax
-from apnpql_jax import errors
+from apnpql_jax import errors, runtime
 from apnpql_jax.cli import commands
 from apnpql_jax.cli.commands import Json
 from apnpql_jax.cli.options import (
@@ -25,8 +24,10 @@ from apnpql_jax.cli.options import (
   parse,
 )
 from apnpql_jax.config import files
-from apnpql_jax.errors import ConfigError, check_name
+from apnpql_jax.console import say
+from apnpql_jax.errors import ConfigError, UserError, check_name
 from apnpql_jax.runs.signals import Signals
+from apnpql_jax.version import __version__
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -35,6 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
   0 success; 2 bad input; 3 a run that had to stop (disk full, values not finite); 130
   Ctrl-C and 143 SIGTERM, with a run saved. All but 0 with one line on standard error.
   """
+  runtime.configure()
   args = list(sys.argv[1:] if argv is None else argv)
   try:
     if not args:
@@ -43,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
       print(_help())
       return 0
     if args[0] == "--version":
-      print(apnpql_jax.__version__)
+      print(__version__)
       return 0
     check_name("command", args[0], list(_COMMANDS))
     kind, command, show = _COMMANDS[args[0]]
@@ -53,11 +55,11 @@ def main(argv: Sequence[str] | None = None) -> int:
       if result:  # Of several processes, the first one tells.
         write(_to_json(result) if parsed.json else show(result))
     return 0
-  except ConfigError as error:
-    _complain(" ".join(str(error).split()))
+  except UserError as error:
+    say(f"apnpql: {' '.join(str(error).split())}")
     return 2
   except errors.RunStopped as stop:
-    _complain(str(stop))
+    say(f"apnpql: {stop}")
     if stop.code == errors.FAILED:
       # Threads of a save that failed half-way may wait for each other for minutes.
       os._exit(stop.code)
@@ -67,12 +69,6 @@ def main(argv: Sequence[str] | None = None) -> int:
   except BrokenPipeError:  # The reader of our output left, as `head` does.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     return 0
-
-
-def _complain(line: str) -> None:
-  # Standard error may lie on the disk that is full; the exit code tells nevertheless.
-  with contextlib.suppress(OSError):
-    print(f"apnpql: {line}", file=sys.stderr, flush=True)
 
 
 def _preset_named(kind: type[Any], args: Sequence[str]) -> Train | None:

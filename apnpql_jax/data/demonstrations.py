@@ -10,13 +10,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 
 from apnpql_jax import devices
 from apnpql_jax.data import npz
-from apnpql_jax.errors import ConfigError
-from apnpql_jax.sim.scene import Scene
+from apnpql_jax.errors import FileError, UserError
+from apnpql_jax.sim.scene import Scene, free_joints
 from apnpql_jax.tasks.task import Task
 from apnpql_jax.types import ACTION_DIM
 
@@ -50,7 +49,7 @@ def save(
   """Writes a demonstration file; returns its name and what it holds.
 
   Raises:
-    ConfigError: it cannot be written.
+    FileError: it cannot be written.
   """
   arrays: dict[str, Any] = {
     "format": FORMAT,
@@ -63,7 +62,7 @@ def save(
     with path.open("wb") as file:  # Given a name, NumPy would append to it.
       np.savez_compressed(file, **arrays)
   except OSError as error:
-    raise ConfigError(f"cannot write {path}: {error}") from None
+    raise FileError(f"cannot write {path}: {error}") from None
   episodes = int(demos.first.sum())
   return {"file": str(path), "instants": demos.instants, "demonstrations": episodes}
 
@@ -72,7 +71,7 @@ def load(path: Path, task: Task, control_period_s: float) -> Demonstrations:
   """Reads and checks a demonstration file.
 
   Raises:
-    ConfigError: it is no such file, of another version, task or control period, or
+    FileError: it is no such file, of another version, task or control period, or
       holds what the scene cannot be in; the message names it.
   """
   arrays = npz.read(path, limit=devices.host_memory() or 1 << 32)
@@ -80,21 +79,19 @@ def load(path: Path, task: Task, control_period_s: float) -> Demonstrations:
   wanted = {"format", "version", "task", "control_period_s", *fields}
   if arrays.keys() != wanted:
     names = ", ".join(sorted(arrays.keys() ^ wanted))
-    raise ConfigError(f"{path} lacks or has in excess: {names}")
+    raise FileError(f"{path} lacks or has in excess: {names}")
   expected = (FORMAT, VERSION, task.name, control_period_s)
   for name, value in zip(("format", "version", "task"), expected, strict=False):
     if str(arrays[name]) != str(value):
-      raise ConfigError(f"{path} has {name} {_shown(arrays[name])}, not {value}")
+      raise FileError(f"{path} has {name} {_shown(arrays[name])}, not {value}")
   period = arrays["control_period_s"]
   if period.shape or period.dtype.kind != "f" or abs(period - expected[3]) > 1e-6:
-    raise ConfigError(
-      f"{path} has control_period_s {_shown(period)}, not {expected[3]}"
-    )
+    raise FileError(f"{path} has control_period_s {_shown(period)}, not {expected[3]}")
   try:
     demos = Demonstrations(**{name: arrays[name] for name in fields})
     check(demos, task.scene)
-  except ConfigError as error:
-    raise ConfigError(f"{path}: {error}") from None
+  except UserError as error:
+    raise FileError(f"{path}: {error}") from None
   return demos
 
 
@@ -102,7 +99,7 @@ def check(demos: Demonstrations, scene: Scene) -> None:
   """Refuses what the scene cannot be in.
 
   Raises:
-    ConfigError: names the array and the first instant that is wrong.
+    FileError: names the array and the first instant that is wrong.
   """
   model, n = scene.model, demos.first.size
   variants = min((len(v) for v in scene.variants.values()), default=1)
@@ -118,13 +115,12 @@ def check(demos: Demonstrations, scene: Scene) -> None:
   for name, (kinds, shape) in shapes.items():
     array = getattr(demos, name)
     if array.dtype.kind not in kinds or array.shape != shape:
-      raise ConfigError(
-        f"{name} is {array.dtype}{list(array.shape)}, not {list(shape)}"
-      )
+      raise FileError(f"{name} is {array.dtype}{list(array.shape)}, not {list(shape)}")
     _refuse(name, "is not finite", ~np.isfinite(array))
   if not n or not demos.first[0]:
-    raise ConfigError("the first instant must begin an episode")
-  quats = [demos.qpos[:, i + 3 : i + 7] for i in _free_joints(model)]
+    raise FileError("the first instant must begin an episode")
+  addresses = model.jnt_qposadr[free_joints(model)]
+  quats = [demos.qpos[:, i + 3 : i + 7] for i in addresses]
   quats += list(np.moveaxis(demos.mocap_quat, 1, 0))
   for quat in quats:
     off = abs(np.linalg.norm(quat, axis=-1) - 1) > 1e-3
@@ -140,10 +136,6 @@ def check(demos: Demonstrations, scene: Scene) -> None:
   _refuse("action", "is not within [-1, 1] rad/s and {0, 1}", wrong)
 
 
-def _free_joints(model: mujoco.MjModel) -> np.ndarray:
-  return model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
-
-
 def _shown(array: np.ndarray) -> str:
   return " ".join(str(array).split())[:40]
 
@@ -151,4 +143,4 @@ def _shown(array: np.ndarray) -> str:
 def _refuse(name: str, what: str, wrong: np.ndarray) -> None:
   if wrong.any():
     instant = int(np.argwhere(wrong)[0][0])
-    raise ConfigError(f"{name} {what} at instant {instant}")
+    raise FileError(f"{name} {what} at instant {instant}")

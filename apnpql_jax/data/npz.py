@@ -10,7 +10,7 @@ import zlib
 
 import numpy as np
 
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import FileError, UserError, one_line
 
 _ERRORS = (OSError, ValueError, EOFError, KeyError, RuntimeError, MemoryError)
 _ERRORS += (NotImplementedError, zipfile.BadZipFile, zlib.error)
@@ -26,7 +26,7 @@ def read(path: Path, *, limit: int) -> dict[str, np.ndarray]:
     limit: bytes that all arrays together may take.
 
   Raises:
-    ConfigError: it is no archive of arrays, is damaged, holds Python objects, or takes
+    FileError: it is no archive of arrays, is damaged, holds Python objects, or takes
       more than ``limit``.
   """
   try:
@@ -34,13 +34,12 @@ def read(path: Path, *, limit: int) -> dict[str, np.ndarray]:
       names = archive.namelist()
       size = sum(_nbytes(archive, name) for name in names)
       if size > limit:
-        raise ConfigError(f"{path} takes {size} bytes, more than {limit}")
+        raise FileError(f"{path} takes {size} bytes, more than {limit}")
       return {name.removesuffix(".npy"): _array(archive, name) for name in names}
-  except ConfigError:
+  except UserError:
     raise
   except _ERRORS as error:
-    text = " ".join(str(error).split())[:200] or type(error).__name__
-    raise ConfigError(f"{path} is no archive of arrays: {text}") from None
+    raise FileError(f"{path} is no archive of arrays: {one_line(error)}") from None
 
 
 def _nbytes(archive: zipfile.ZipFile, name: str) -> int:

@@ -15,9 +15,9 @@ import numpy as np
 from apnpql_jax import devices
 from apnpql_jax.data import demonstrations, npz
 from apnpql_jax.data.demonstrations import Demonstrations
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import FileError, UserError
 from apnpql_jax.sim.physics import MAX_VELOCITY
-from apnpql_jax.sim.scene import Scene
+from apnpql_jax.sim.scene import Scene, free_joints
 
 _STILL = 0.02
 """Share of the gripper's travel per period below which its command is held."""
@@ -40,7 +40,7 @@ def convert(path: Path, scene: Scene, *, period_s: float) -> Demonstrations:
     period_s: control period, s.
 
   Raises:
-    ConfigError: poses are missing, a shape is wrong, or the arm moves faster than it
+    FileError: poses are missing, a shape is wrong, or the arm moves faster than it
       may.
   """
   arrays = _read(path, scene.model)
@@ -54,8 +54,8 @@ def convert(path: Path, scene: Scene, *, period_s: float) -> Demonstrations:
     demos = Demonstrations(*(np.concatenate(x) for x in zip(*parts, strict=True)))
     demos = demos._replace(variant=np.full(demos.instants, variant))
     demonstrations.check(demos, scene)
-  except ConfigError as error:
-    raise ConfigError(f"{path}: {error}") from None
+  except UserError as error:
+    raise FileError(f"{path}: {error}") from None
   return demos._replace(variant=demos.variant.astype(np.int32))
 
 
@@ -65,30 +65,30 @@ def _read(path: Path, model: mujoco.MjModel) -> dict[str, np.ndarray]:
   bodies = _bodies(model)
   missing = sorted(bodies.keys() - arrays.keys())
   if missing:
-    raise ConfigError(
+    raise FileError(
       f"{path} lacks the poses of {', '.join(missing)}: rewards, labels and images are "
       "made from them, and joint angles or pictures alone do not tell them"
     )
   shapes = {"time": (), "joints": (6,), "gripper": (), **dict.fromkeys(bodies, (7,))}
   if unknown := sorted(arrays.keys() - shapes.keys() - {"episode", "variant"}):
-    raise ConfigError(f"{path} has unknown arrays {unknown}; known: {sorted(shapes)}")
+    raise FileError(f"{path} has unknown arrays {unknown}; known: {sorted(shapes)}")
   count = arrays["time"].shape[:1] if "time" in arrays else ()
   for name, shape in shapes.items():
     array = arrays.get(name)
     numbers = array is not None and array.dtype.kind in "fiu"
     if not numbers or not count or array.shape != count + shape:
-      raise ConfigError(f"{path}: {name} must be numbers of shape {['n', *shape]}")
+      raise FileError(f"{path}: {name} must be numbers of shape {['n', *shape]}")
     arrays[name] = array = np.asarray(array, np.float64)
     if not (abs(array) < _LARGEST).all():
-      raise ConfigError(f"{path}: {name} is not finite")
+      raise FileError(f"{path}: {name} is not finite")
     off = abs(np.linalg.norm(array[:, 3:], axis=1) - 1) if name in bodies else 0.0
     if np.max(off, initial=0.0) > 0.1:
-      raise ConfigError(f"{path}: a quaternion of {name} is not of unit length")
+      raise FileError(f"{path}: a quaternion of {name} is not of unit length")
   if arrays.setdefault("episode", np.zeros(count)).shape != count:
-    raise ConfigError(f"{path}: episode must have shape ['n']")
+    raise FileError(f"{path}: episode must have shape ['n']")
   variant = arrays.setdefault("variant", np.zeros((), int))
   if variant.shape or variant.dtype.kind not in "iu":
-    raise ConfigError(f"{path}: variant must be one whole number")
+    raise FileError(f"{path}: variant must be one whole number")
   return arrays
 
 
@@ -99,9 +99,9 @@ def _episode(
   model, time = scene.model, recorded["time"]
   steps = np.diff(time)
   if not len(steps) or (steps <= 0).any():
-    raise ConfigError("time must increase within an episode")
+    raise FileError("time must increase within an episode")
   if steps.max() > _LONGEST_GAP_S:
-    raise ConfigError(
+    raise FileError(
       f"{steps.max():.3g} s lie between two samples, more than {_LONGEST_GAP_S}; begin "
       "another episode there"
     )
@@ -143,12 +143,12 @@ def _actions(joints: np.ndarray, gripper: np.ndarray, period_s: float) -> np.nda
   """f32[n, 7] that lead from each instant to the next.
 
   Raises:
-    ConfigError: none does, because the arm moves too fast.
+    FileError: none does, because the arm moves too fast.
   """
   action = np.zeros((len(joints), 7), np.float32)
   velocity = np.diff(joints, axis=0) / period_s
   if abs(velocity).max(initial=0.0) > 1.05 * MAX_VELOCITY:
-    raise ConfigError(
+    raise FileError(
       f"the arm moves at {abs(velocity).max():.2f} rad/s, but no action goes beyond "
       f"{MAX_VELOCITY}; record it slower"
     )
@@ -195,6 +195,6 @@ def _bodies(model: mujoco.MjModel) -> dict[str, tuple[str, int]]:
     name, joint = model.body(i).name, model.body_jntadr[i]
     if model.body_mocapid[i] >= 0:
       bodies[name] = ("mocap", int(model.body_mocapid[i]))
-    elif joint >= 0 and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
+    elif joint in free_joints(model):
       bodies[name] = ("free", int(model.jnt_qposadr[joint]))
   return bodies

@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any
 from flax import struct
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress
@@ -36,7 +35,8 @@ from apnpql_jax.sim.native import NativePhysics
 from apnpql_jax.types import Array
 
 if TYPE_CHECKING:  # Tasks know the primitives, so only the type may be known here.
-  from apnpql_jax.tasks.task import Task
+  from apnpql_jax.sim.scene import free_joints
+from apnpql_jax.tasks.task import Task
 
 VERSION = 3
 """Raised when the meaning of a bank changes; part of the cache key."""
@@ -150,18 +150,13 @@ def _settled(
   for _ in range(SETTLE_PERIODS):
     state = engine.step(state, jnp.zeros((count, 6)), closed.astype(jnp.float32))
   restless = np.abs(np.asarray(state.qvel)).max(-1) > SETTLE_SPEED
-  for address in _free_joints(task):
+  model = task.scene.model
+  for address in model.jnt_qposadr[free_joints(model)]:
     shift = np.asarray(state.qpos - draw.qpos)[:, address : address + 3]
     restless |= np.linalg.norm(shift, axis=-1) > SETTLE_SHIFT
   report.drawn += count
   report.rejected_restless += int(restless.sum())
   return jax.tree.map(lambda x: x[~restless], (state, draw.variant))
-
-
-def _free_joints(task: Task) -> np.ndarray:
-  """i32[n]: where the positions of bodies that float freely begin in qpos."""
-  model = task.scene.model
-  return model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
 
 
 def _solve_targets(

@@ -14,12 +14,11 @@ from typing import Any, NamedTuple
 
 from apnpql_jax.config.files import config_diff, config_from_json, format_diff
 from apnpql_jax.config.schema import TrainConfig
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import FileError, UserError, one_line
 from apnpql_jax.runs import checkpoint_record, leaves
 from apnpql_jax.runs.checkpoint_record import (
   DamagedError,
   best,
-  first_line,
   newest_until,
   title,
 )
@@ -65,7 +64,7 @@ def check(run_dir: Path, step: int | None, *, config: TrainConfig | None = None)
     the step.
 
   Raises:
-    ConfigError: there is no such checkpoint, or it belongs to another configuration
+    FileError: there is no such checkpoint, or it belongs to another configuration
       or format.
   """
   steps = _candidates(run_dir, step)
@@ -102,7 +101,7 @@ def restore(
       settings that a resumed run may change.
 
   Raises:
-    ConfigError: there is no such checkpoint, it belongs to another configuration or
+    FileError: there is no such checkpoint, it belongs to another configuration or
       format, it holds other leaves than the example, or its files cannot be read.
   """
   damaged: list[str] = []
@@ -124,23 +123,23 @@ def _candidates(run_dir: Path, step: int | None) -> list[int]:
   """The step asked for, or all, newest first."""
   steps = all_steps(run_dir)
   if not steps:
-    raise ConfigError(f"{str(run_dir)!r} has no checkpoint")
+    raise FileError(f"{str(run_dir)!r} has no checkpoint")
   if step is None:
     return steps[::-1]
   if step not in steps:
     valid = ", ".join(map(str, steps))
-    raise ConfigError(f"{str(run_dir)!r} has no checkpoint {step}; choose from {valid}")
+    raise FileError(f"{str(run_dir)!r} has no checkpoint {step}; choose from {valid}")
   return [step]
 
 
 def _check_config(name: str, saved: Any, wanted: TrainConfig) -> None:
   try:
     diff = config_diff(config_from_json(json.dumps(saved)), wanted)
-  except ConfigError as error:
-    raise ConfigError(f"{name}: {error}") from None
+  except UserError as error:
+    raise FileError(f"{name}: {error}") from None
   diff = {field: pair for field, pair in diff.items() if field not in MAY_CHANGE}
   if diff:
-    raise ConfigError(f"{name} belongs to other settings: {format_diff(diff)}")
+    raise FileError(f"{name} belongs to other settings: {format_diff(diff)}")
 
 
 def _step_with(run_dir: Path, last: int, item: str) -> int:
@@ -167,10 +166,10 @@ def _restore_item(run_dir: Path, step: int, item: str, example: Any) -> Any:
   except Exception as error:  # Whatever Orbax or the file system found wrong.
     # Pages of it would come from each of its tasks for which nobody waits any more.
     logging.getLogger("asyncio").setLevel(logging.CRITICAL)
-    raise DamagedError(f"{name} cannot be read: {first_line(error)}") from error
+    raise DamagedError(f"{name} cannot be read: {one_line(error)}") from error
   checkpoint_record.check_bits(name, saved, tree)
   impls = {path: leaf.key_impl for path, leaf in saved.items() if leaf.key_impl}
   try:
     return leaves.to_typed(tree, impls, example)
   except (TypeError, ValueError) as error:
-    raise DamagedError(f"{name} cannot be read: {first_line(error)}") from None
+    raise DamagedError(f"{name} cannot be read: {one_line(error)}") from None

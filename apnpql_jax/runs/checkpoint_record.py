@@ -16,7 +16,7 @@ import zlib
 
 from apnpql_jax.config.files import config_to_json
 from apnpql_jax.config.schema import TrainConfig
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import FileError, UserError, one_line
 from apnpql_jax.runs import leaves, text
 
 SCHEMA_VERSION = 2
@@ -26,7 +26,7 @@ _MAX_BYTES = 16 << 20
 """A record has some hundred bytes per leaf; a longer file is none of ours."""
 
 
-class DamagedError(ConfigError):
+class DamagedError(FileError):
   """A checkpoint that is not as it was written; an older one may be."""
 
 
@@ -70,7 +70,7 @@ def read(run_dir: Path, step: int) -> Record:
 
   Raises:
     DamagedError: it is not there or not as it was written.
-    ConfigError: it has another format.
+    FileError: it has another format.
   """
   path = folder(run_dir) / str(step) / "meta" / "metadata"
   name = title(run_dir, step)
@@ -79,7 +79,7 @@ def read(run_dir: Path, step: int) -> Record:
     version, crc32 = record["schema_version"], record.pop("crc32", None)
     whole = crc32 == _checksum(record)
     if version != SCHEMA_VERSION and (whole or crc32 is None):
-      raise ConfigError(
+      raise FileError(
         f"{name} has format {str(version)[:20]}; this code reads {SCHEMA_VERSION}"
       )
     if not whole:
@@ -90,7 +90,7 @@ def read(run_dir: Path, step: int) -> Record:
     }
     rate = record["success_rate"]
     return Record(record["config"], None if rate is None else float(rate), items)
-  except ConfigError:
+  except UserError:
     raise
   except (
     OSError,
@@ -100,7 +100,7 @@ def read(run_dir: Path, step: int) -> Record:
     TypeError,
     AttributeError,
   ) as e:
-    raise DamagedError(f"{name} cannot be read: {first_line(e)}") from None
+    raise DamagedError(f"{name} cannot be read: {one_line(e)}") from None
 
 
 def read_all(run_dir: Path) -> dict[int, Record]:
@@ -109,7 +109,7 @@ def read_all(run_dir: Path) -> dict[int, Record]:
   for step in steps(run_dir):
     try:
       records[step] = read(run_dir, step)
-    except ConfigError:  # Named where somebody asks for it.
+    except UserError:  # Named where somebody asks for it.
       continue
   return records
 
@@ -131,11 +131,6 @@ def title(run_dir: Path, step: int) -> str:
   return f"checkpoint {step} of {str(run_dir)!r}"
 
 
-def first_line(error: BaseException) -> str:
-  """What went wrong, fit for one line."""
-  return " ".join(str(error).split())[:200] or type(error).__name__
-
-
 def best(rates: Mapping[int, float | None]) -> int | None:
   """Step of the highest rate, the newest of equals; None if there is none."""
   known = {step: rate for step, rate in rates.items() if rate is not None}
@@ -151,14 +146,14 @@ def check_kinds(name: str, saved: Mapping[str, Leaf], example: Any) -> None:
   """Refuses leaves of another name, dtype or shape than those of ``example``.
 
   Raises:
-    ConfigError: names the first leaf that differs.
+    FileError: names the first leaf that differs.
   """
   wanted = leaves.describe(example)
   for path in sorted(saved.keys() | wanted.keys()):
     held = saved[path].kind if path in saved else "nothing"
     expected = wanted.get(path, "nothing")
     if held != expected:
-      raise ConfigError(f"{name} holds {held} at {path}, where {expected} is expected")
+      raise FileError(f"{name} holds {held} at {path}, where {expected} is expected")
 
 
 def check_bits(name: str, saved: Mapping[str, Leaf], tree: Any) -> None:

@@ -13,8 +13,9 @@ import time
 from typing import Any
 
 from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.errors import one_line
 from apnpql_jax.runs import checkpoint_record, leaves
-from apnpql_jax.runs.checkpoint_record import best, first_line, newest_until
+from apnpql_jax.runs.checkpoint_record import best, newest_until
 
 _CHUNK_BYTES = 16 << 20
 """Unit of compression: a replay as one chunk took one core twice as long."""
@@ -188,5 +189,5 @@ def _save_args(plain: Any) -> Any:
 
 def _cause(error: Exception) -> str:
   """What the file system said, without the names of temporary files around it."""
-  text = " ".join(str(error).split())
-  return text.rpartition(": ")[2] if "os_error_code" in text else first_line(error)
+  text = one_line(error)
+  return text.rpartition(": ")[2] if "os_error_code" in text else text

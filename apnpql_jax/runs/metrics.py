@@ -12,7 +12,7 @@ from statistics import NormalDist
 import time
 from typing import Any, Protocol
 
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import FileError
 from apnpql_jax.runs.text import write_text
 
 STEP = "step"
@@ -98,7 +98,7 @@ class MetricWriter:
       max_bytes: of ``metrics.jsonl``, above which a new one is begun.
 
     Raises:
-      ConfigError: there are rows that cannot be read.
+      FileError: there are rows that cannot be read.
     """
     self._jsonl, self._csv = run_dir / "metrics.jsonl", run_dir / "metrics.csv"
     self._sinks, self._clock, self._max_bytes = tuple(sinks), clock, max_bytes
@@ -195,7 +195,7 @@ def read_rows(path: Path, *, having: str = "") -> list[Row]:
       rows are evaluations.
 
   Raises:
-    ConfigError: a line is not a row, other than a last one that was cut off.
+    FileError: a line is not a row, other than a last one that was cut off.
   """
   if not path.exists():
     return []
@@ -210,7 +210,7 @@ def read_rows(path: Path, *, having: str = "") -> list[Row]:
         row = json.loads(line)
         row[STEP] + 0
       except (ValueError, TypeError, KeyError):
-        raise ConfigError(f"{path}, line {number}: not a row of metrics") from None
+        raise FileError(f"{path}, line {number}: not a row of metrics") from None
       rows.append(row)
   return rows
 

@@ -19,7 +19,7 @@ from apnpql_jax.config.files import (
   format_diff,
 )
 from apnpql_jax.config.schema import TrainConfig
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import ConfigError, FileError, UserError
 from apnpql_jax.runs.text import read_text, write_text
 from apnpql_jax.runs.versions import describe_versions
 
@@ -85,7 +85,7 @@ def create(
   """Makes the folder and writes ``config.json`` and ``versions.json`` into it.
 
   Raises:
-    ConfigError: it holds a run and ``overwrite`` is not set, or something that is no
+    FileError: it holds a run and ``overwrite`` is not set, or something that is no
       run, which is never removed; or it cannot be made.
   """
   check_free(run_dir, overwrite=overwrite)
@@ -102,7 +102,7 @@ def open_run(run_dir: Path) -> RunFolder:
   """An existing run, to resume or to evaluate.
 
   Raises:
-    ConfigError: it is not a run folder, its configuration cannot be read, or links
+    FileError: it is not a run folder, its configuration cannot be read, or links
       lead out of it.
   """
   check_contained(run_dir)
@@ -127,21 +127,21 @@ def load_run_config(
     say: is told in one line which settings came after the run, if any.
 
   Raises:
-    ConfigError: not a run folder, or its configuration cannot be read.
+    FileError: not a run folder, or its configuration cannot be read.
   """
   path = run_dir / CONFIG_FILE
   if not path.is_file():
-    raise ConfigError(
+    raise FileError(
       f"{str(run_dir)!r} is not a run folder (no {CONFIG_FILE}); "
       f"{_nearby_runs(run_dir)}"
     )
   try:
     text = read_text(path, _MAX_CONFIG_BYTES)
     return config_from_json(text, lambda line: say(f"{path} is {line}"))
-  except ConfigError as error:
-    raise ConfigError(f"{path}: {error}") from None
+  except UserError as error:
+    raise FileError(f"{path}: {error}") from None
   except (OSError, ValueError) as error:
-    raise ConfigError(f"{path} cannot be read: {error}") from None
+    raise FileError(f"{path} cannot be read: {error}") from None
 
 
 def check_contained(run_dir: Path) -> None:
@@ -150,20 +150,20 @@ def check_contained(run_dir: Path) -> None:
   What a run writes, and the checkpoints it deletes, would then lie elsewhere.
 
   Raises:
-    ConfigError: names the first such link.
+    FileError: names the first such link.
   """
   inside = run_dir.resolve()
   for path in sorted(run_dir.rglob("*")):
     if path.is_symlink() and not path.resolve().is_relative_to(inside):
-      raise ConfigError(f"{path} is a link that leads out of the run folder")
+      raise FileError(f"{path} is a link that leads out of the run folder")
 
 
 def check_resumable(run_dir: Path, wanted: TrainConfig) -> None:
   """Refuses to go on with settings other than those of the checkpoint.
 
   Raises:
-    ConfigError: a setting outside ``MAY_CHANGE`` differs; the message lists each. Or
-      the run is being trained.
+    ConfigError: a setting outside ``MAY_CHANGE`` differs; the message lists each.
+    FileError: another process trains the run.
   """
   diff = config_diff(load_run_config(run_dir), wanted)
   diff = {name: pair for name, pair in diff.items() if name not in MAY_CHANGE}
@@ -184,7 +184,7 @@ def lock(run_dir: Path, *, shared: bool = False) -> Generator[None, None, None]:
     shared: take a shared lock, which fails if another process holds the exclusive one.
 
   Raises:
-    ConfigError: another process trains there.
+    FileError: another process trains there.
   """
   folder = os.open(run_dir, os.O_RDONLY)
   try:
@@ -192,7 +192,7 @@ def lock(run_dir: Path, *, shared: bool = False) -> Generator[None, None, None]:
       kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
       fcntl.flock(folder, kind | fcntl.LOCK_NB)
     except BlockingIOError:
-      raise ConfigError(f"{str(run_dir)!r} is trained by another process") from None
+      raise FileError(f"{str(run_dir)!r} is trained by another process") from None
     except OSError:  # Some file systems have no locks.
       pass
     yield
@@ -209,21 +209,21 @@ def check_free(run_dir: Path, *, overwrite: bool) -> None:
   """Refuses a run folder that holds something, unless it is a run to overwrite.
 
   Raises:
-    ConfigError: the folder is in use, or is no run folder and so never removed, or
+    FileError: the folder is in use, or is no run folder and so never removed, or
       its run is being trained.
   """
   if not run_dir.exists():
     return
   if not run_dir.is_dir() or run_dir.is_symlink():
-    raise ConfigError(f"{str(run_dir)!r} is not a folder; choose another --run")
+    raise FileError(f"{str(run_dir)!r} is not a folder; choose another --run")
   if not any(run_dir.iterdir()):
     return
   if not (run_dir / CONFIG_FILE).is_file():
-    raise ConfigError(
+    raise FileError(
       f"{str(run_dir)!r} holds something that is not a run; choose another --run"
     )
   if not overwrite:
-    raise ConfigError(
+    raise FileError(
       f"{str(run_dir)!r} holds a run; go on with --resume {run_dir}, replace it with "
       "--overwrite, or choose another --run"
     )
@@ -238,7 +238,7 @@ def fresh_run_dir(run_dir: Path) -> Generator[Path, None, None]:
   ``config.json``, the folder is as it was before.
 
   Raises:
-    ConfigError: the folder cannot be made; also re-raised from the body.
+    FileError: the folder cannot be made; also re-raised from the body.
   """
   run_dir = run_dir.absolute()
   aside = _free_name(run_dir) if run_dir.exists() else None
@@ -249,12 +249,12 @@ def fresh_run_dir(run_dir: Path) -> Generator[Path, None, None]:
   except OSError as error:
     if aside is not None and aside.exists() and not run_dir.exists():
       aside.rename(run_dir)
-    raise ConfigError(f"cannot make run folder {str(run_dir)!r}: {error}") from None
+    raise FileError(f"cannot make run folder {str(run_dir)!r}: {error}") from None
   try:
     yield run_dir
   except BaseException as error:
     # Refused, or stopped before anything was written: give back what was there.
-    if isinstance(error, ConfigError) or not (run_dir / CONFIG_FILE).exists():
+    if isinstance(error, FileError) or not (run_dir / CONFIG_FILE).exists():
       shutil.rmtree(run_dir, ignore_errors=True)
       if aside is not None:
         aside.rename(run_dir)

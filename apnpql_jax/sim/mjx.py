@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-import mujoco
 from mujoco import mjx
+import numpy as np
 
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.mjx_patches import patch_mjx
 from apnpql_jax.sim.physics import PhysicsState
-from apnpql_jax.sim.scene import Scene
+from apnpql_jax.sim.scene import Scene, free_joints
 from apnpql_jax.types import Array
 
 
@@ -28,8 +28,7 @@ class MjxPhysics:
     patch_mjx()
     self.scene = scene
     self._substeps = substeps
-    joints = scene.model.jnt_type[scene.model.dof_jntid]
-    self._free = joints == mujoco.mjtJoint.mjJNT_FREE
+    self._free = np.isin(scene.model.dof_jntid, free_joints(scene.model))
     device = jax.local_devices()[0]  # MJX would take the first one of all processes.
     line_search = int(scene.model.numeric("mjx_ls_iterations").data[0])
     self._model = mjx.put_model(scene.model, device, impl="jax").tree_replace(

@@ -69,8 +69,7 @@ class Scene:
   def free_joint(self, body: str) -> tuple[int, int]:
     """(qpos, qvel) addresses of the free joint of ``body``."""
     joint = self.model.body_jntadr[self.id("body", body)]
-    is_free = joint >= 0 and (self.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE)
-    if not is_free:
+    if joint not in free_joints(self.model):
       raise ConfigError(f"{self.name}.xml: body '{body}' has no free joint")
     return int(self.model.jnt_qposadr[joint]), int(self.model.jnt_dofadr[joint])
 
@@ -208,3 +207,8 @@ def _fingerprint(models: Sequence[mujoco.MjModel]) -> str:
     mujoco.mj_saveModel(model, None, buffer)
     digest.update(buffer.tobytes())
   return digest.hexdigest()
+
+
+def free_joints(model: mujoco.MjModel) -> np.ndarray:
+  """Returns the ids of the free joints, i64[n]."""
+  return np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
-import sys
 import time
 from typing import Any
 
@@ -16,6 +15,7 @@ import numpy as np
 from apnpql_jax import devices
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config.schema import EnvConfig
+from apnpql_jax.console import say
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.runs import checkpoint_reader, leaves, run_folder
 from apnpql_jax.runs.metrics import wilson_interval
@@ -111,7 +111,7 @@ def evaluate(
   devices.check_memory(leaves.nbytes(example), "the learner")
   found = checkpoint_reader.restore(run_dir, step, {"learner": example}, config=config)
   for line in found.damaged:
-    print(line, file=sys.stderr)
+    say(line)
   learner = found.items["learner"]
   play = make_player(env, lambda params: agent_policy(agent, params, greedy=greedy))
   figures = _figures(
@@ -162,5 +162,5 @@ def _figures(
   try:
     return figures | {"video": str(record_episodes(env, played, video))}
   except OSError as error:  # The figures took minutes.
-    print(f"cannot write {video}: {error}", file=sys.stderr)
+    say(f"cannot write {video}: {error}")
     return figures | {"video": None}

@@ -16,7 +16,7 @@ from apnpql_jax.data.demonstrations import Demonstrations
 from apnpql_jax.data.replay import Replay
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.envs.state import EnvState
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import FileError
 from apnpql_jax.primitives import ik
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.physics import PhysicsState
@@ -186,7 +186,7 @@ def _solve_targets(demos: Demonstrations, rows: np.ndarray, env: Env) -> np.ndar
   targets, residuals = ik.solve_all(starts, positions, rotations)
   far = (residuals > [ik.POSITION_TOLERANCE, ik.ROTATION_TOLERANCE]).any((1, 2))
   if far.any():
-    raise ConfigError(
+    raise FileError(
       f"demonstrations: the arm cannot reach a primitive's target at instant "
       f"{unique[far.argmax()]}"
     )

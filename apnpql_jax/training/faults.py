@@ -18,7 +18,7 @@ from apnpql_jax import devices, errors
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.data import npz
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import FileError, one_line
 from apnpql_jax.runs import leaves, run_folder
 from apnpql_jax.runs.run_folder import RunFolder
 from apnpql_jax.training.iteration import make_sample
@@ -70,7 +70,7 @@ def repeat(path: Path) -> dict[str, list[str]]:
     update, and among the metrics.
 
   Raises:
-    ConfigError: it is no such file, or does not lie in its run folder.
+    FileError: it is no such file, or does not lie in its run folder.
   """
   config = run_folder.load_run_config(path.absolute().parent.parent)
   arrays = npz.read(path, limit=_MAX_BYTES)
@@ -82,8 +82,7 @@ def repeat(path: Path) -> dict[str, list[str]]:
     key = jax.random.wrap_key_data(jnp.asarray(arrays["key"]))
     after, metrics = jax.jit(agent.update)(learner, batch, key)
   except (KeyError, TypeError, ValueError) as error:
-    text = " ".join(str(error).split())[:200]
-    raise ConfigError(f"{path} is no update of this run: {text}") from None
+    raise FileError(f"{path} is no update of this run: {one_line(error)}") from None
   return {
     "batch": _not_finite(batch),
     "learner_before": _not_finite(learner),

@@ -11,7 +11,6 @@ import dataclasses
 import logging
 from pathlib import Path
 import signal
-import sys
 from typing import Any
 
 from jax.sharding import Mesh
@@ -20,6 +19,7 @@ from apnpql_jax import devices, errors
 from apnpql_jax.agents.learner import Agent, make_agent
 from apnpql_jax.config import codec
 from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.console import say
 from apnpql_jax.data import demonstrations, replay
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.errors import RunStopped
@@ -224,7 +224,7 @@ def _loop(config, iteration, state, reporter, saver, signals) -> TrainState:
 
 def _say(text: str) -> None:
   if devices.leads():
-    print(text, file=sys.stderr, flush=True)
+    say(text)
 
 
 def _passed(before: int, now: int, every: int) -> bool:

@@ -18,7 +18,7 @@ from apnpql_jax.cli import main
 from apnpql_jax.data import demonstrations, real_arm
 from apnpql_jax.data.demonstrations import Demonstrations
 from apnpql_jax.envs.env import Env, make_env
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import ConfigError, UserError
 from apnpql_jax.sim.physics import START_TIME, Physics, PhysicsState
 from apnpql_jax.training import expert
 from apnpql_jax.training.rollout import expert_policy, make_player
@@ -165,21 +165,21 @@ def test_what_the_scene_cannot_be_in_is_refused(path, demos, env, name):
   change, message = WRONG[name]
   wrong = demos._replace(**{name: change(getattr(demos, name))})
   demonstrations.save(path, wrong, task="push_plate", control_period_s=0.15)
-  with pytest.raises(ConfigError, match=message):
+  with pytest.raises(UserError, match=message):
     demonstrations.load(path, env.task, env.config.control_period_s)
 
 
 def test_other_files_are_refused_by_name(path, demos, env):
   demonstrations.save(path, demos, task="stack_box", control_period_s=0.15)
-  with pytest.raises(ConfigError, match="has task stack_box, not push_plate"):
+  with pytest.raises(UserError, match="has task stack_box, not push_plate"):
     demonstrations.load(path, env.task, env.config.control_period_s)
   demonstrations.save(path, demos, task="push_plate", control_period_s=0.1)
-  with pytest.raises(ConfigError, match=r"control_period_s 0\.1, not 0\.15"):
+  with pytest.raises(UserError, match=r"control_period_s 0\.1, not 0\.15"):
     demonstrations.load(path, env.task, env.config.control_period_s)
   np.savez(path, format=demonstrations.FORMAT, version=2)
-  with pytest.raises(ConfigError, match="lacks or has in excess: action"):
+  with pytest.raises(UserError, match="lacks or has in excess: action"):
     demonstrations.load(path, env.task, env.config.control_period_s)
-  with pytest.raises(ConfigError, match="no archive"):
+  with pytest.raises(UserError, match="no archive"):
     demonstrations.load(path.with_name("none"), env.task, env.config.control_period_s)
 
 
@@ -260,7 +260,7 @@ def test_what_a_recording_cannot_tell_is_asked_for(tmp_path, demos, env):
       k: v for k, v in (whole | changes).items() if v is not None
     }
     np.savez(path, **changed)
-    with pytest.raises(ConfigError, match=match):
+    with pytest.raises(UserError, match=match):
       real_arm.convert(path, env.task.scene, period_s=0.15)
 
   refused("lacks the poses of goal, plate: rewards, labels", plate=None, goal=None)

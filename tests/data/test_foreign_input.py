@@ -15,7 +15,7 @@ from apnpql_jax.config.codec import flatten
 from apnpql_jax.config.files import config_from_json, config_to_json
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.data import npz
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import ConfigError, UserError
 from apnpql_jax.runs import run_folder
 
 NUMBERS = st.one_of(
@@ -41,7 +41,7 @@ def _one_line(error: pytest.ExceptionInfo[BaseException]) -> bool:
 @settings(max_examples=300, deadline=None)
 @given(st.text() | JSON.map(lambda data: json.dumps(data, default=str)))
 def test_no_text_is_taken_for_a_configuration(text: str):
-  with pytest.raises(ConfigError) as error:
+  with pytest.raises(UserError) as error:
     config_from_json(text)
   assert _one_line(error)
 
@@ -94,7 +94,7 @@ def test_a_damaged_archive_is_refused_or_right(archive, tmp_path: Path, edits):
 @given(st.binary(max_size=300))
 def test_bytes_are_no_archive(tmp_path: Path, data: bytes):
   (tmp_path / "a.npz").write_bytes(data)
-  with pytest.raises(ConfigError) as error:
+  with pytest.raises(UserError) as error:
     npz.read(tmp_path / "a.npz", limit=10_000)
   assert _one_line(error)
 
@@ -105,7 +105,7 @@ def test_nothing_in_an_archive_is_executed(tmp_path: Path):
       return (Path.touch, (tmp_path / "executed",))
 
   np.savez(tmp_path / "a.npz", a=np.array([Trap()], dtype=object))
-  with pytest.raises(ConfigError, match="no plain array"):
+  with pytest.raises(UserError, match="no plain array"):
     npz.read(tmp_path / "a.npz", limit=10_000)
   assert not (tmp_path / "executed").exists()
 
@@ -119,7 +119,7 @@ def test_a_header_that_asks_for_too_much_takes_no_memory(tmp_path: Path):
   assert header != data
   with zipfile.ZipFile(tmp_path / "a.npz", "w") as file:
     file.writestr("a.npy", header)
-  with pytest.raises(ConfigError, match="8796093022208 bytes, more than 10000"):
+  with pytest.raises(UserError, match="8796093022208 bytes, more than 10000"):
     npz.read(tmp_path / "a.npz", limit=10_000)
 
 
@@ -130,7 +130,7 @@ def test_links_must_not_lead_out_of_a_run_folder(tmp_path: Path):
   (run / "inside").symlink_to(run / "config.json")
   run_folder.open_run(run)
   (run / "checkpoints").symlink_to(outside)
-  with pytest.raises(ConfigError, match="checkpoints is a link that leads out"):
+  with pytest.raises(UserError, match="checkpoints is a link that leads out"):
     run_folder.open_run(run)
 
 
@@ -138,7 +138,7 @@ def test_a_configuration_of_gigabytes_is_not_read(tmp_path: Path):
   run = run_folder.create(tmp_path / "run", TrainConfig()).path
   with (run / "config.json").open("r+b") as file:
     file.truncate(8 << 30)  # Sparse: it takes no room on the disk.
-  with pytest.raises(ConfigError, match="more than 1048576 bytes"):
+  with pytest.raises(UserError, match="more than 1048576 bytes"):
     run_folder.load_run_config(run)
 
 

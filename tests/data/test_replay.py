@@ -15,7 +15,7 @@ from scipy import stats
 
 from apnpql_jax import devices
 from apnpql_jax.data import replay as rb
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import UserError
 from apnpql_jax.runs import leaves
 from apnpql_jax.types import Observation, Slot, TimeStep, Transition
 
@@ -421,12 +421,12 @@ def test_add_writes_into_the_donated_buffer():
 def test_a_ring_larger_than_memory_is_refused_in_one_line():
   ring = jax.eval_shape(lambda: rb.create(_example(pixels=72 * 96), 10**7, 1000))
   needed = leaves.nbytes(ring)
-  with pytest.raises(ConfigError, match=r"replay needs .* GiB .*replay.capacity") as e:
+  with pytest.raises(UserError, match=r"replay needs .* GiB .*replay.capacity") as e:
     devices.check_memory(needed, "the agent replay")
   assert "\n" not in str(e.value)
   devices.check_memory(1000, "the agent replay")
   devices.check_memory(1000, "the agent replay", available=1000)
-  with pytest.raises(ConfigError):
+  with pytest.raises(UserError):
     devices.check_memory(1001, "the agent replay", available=1000)
 
 

@@ -24,7 +24,7 @@ import pytest
 
 from apnpql_jax.config.files import config_to_json
 from apnpql_jax.config.schema import AgentConfig, TrainConfig
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import ConfigError, UserError
 from apnpql_jax.runs import checkpoint_reader, checkpoint_record
 from apnpql_jax.runs.checkpoint_writer import CheckpointWriter, SaveError
 from apnpql_jax.training import resume
@@ -166,7 +166,7 @@ def test_other_settings_are_refused_by_name(tmp_path: Path):
   _save(tmp_path, (1, _state(), None))
   agent = AgentConfig(gamma=0.95, num_atoms=21)
   other = dataclasses.replace(CONFIG, agent=agent, seed=5)
-  with pytest.raises(ConfigError) as error:
+  with pytest.raises(UserError) as error:
     _restore(tmp_path, 1, _state(), config=other)
   for part in ("agent.gamma 0.99 -> 0.95", "agent.num_atoms 51 -> 21", "seed 0 -> 5"):
     assert part in str(error.value)
@@ -190,12 +190,12 @@ def test_a_checkpoint_from_before_a_setting_is_read_as_it_was(
   _save(tmp_path, (1, _state(1), None))
   _assert_same_bits(_restore(tmp_path, 1, _state(), config=CONFIG), _state(1))
   deeper = dataclasses.replace(CONFIG, agent=AgentConfig(residual_blocks=2))
-  with pytest.raises(ConfigError, match="agent.residual_blocks 0 -> 2"):
+  with pytest.raises(UserError, match="agent.residual_blocks 0 -> 2"):
     _restore(tmp_path, 1, _state(), config=deeper)
   # A setting that was always there cannot be missing.
   monkeypatch.setattr(checkpoint_record, "config_to_json", as_then("gamma"))
   _save(tmp_path, (2, _state(2), None))
-  with pytest.raises(ConfigError, match="checkpoint 2 of .*'agent.gamma' is missing"):
+  with pytest.raises(UserError, match="checkpoint 2 of .*'agent.gamma' is missing"):
     _restore(tmp_path, None, _state(), config=CONFIG)
 
 
@@ -203,27 +203,27 @@ def test_other_leaves_are_refused_by_name(tmp_path: Path):
   state = _state()
   _save(tmp_path, (1, state, None))
   cast = dataclasses.replace(state, images=state.images.astype(jnp.float32))
-  with pytest.raises(ConfigError, match=r"uint8\[5, 2, 3\] at images.*float32"):
+  with pytest.raises(UserError, match=r"uint8\[5, 2, 3\] at images.*float32"):
     _restore(tmp_path, 1, cast)
-  with pytest.raises(ConfigError, match=r"uint8\[5, 2, 3\] at images.*uint8\[6"):
+  with pytest.raises(UserError, match=r"uint8\[5, 2, 3\] at images.*uint8\[6"):
     _restore(tmp_path, 1, _state(images=6))
   more = dataclasses.replace(state, params={**state.params, "new": jnp.zeros(2)})
-  with pytest.raises(ConfigError, match=r"holds nothing at params/new"):
+  with pytest.raises(UserError, match=r"holds nothing at params/new"):
     _restore(tmp_path, 1, more)
-  with pytest.raises(ConfigError, match=r"at absent"):
+  with pytest.raises(UserError, match=r"at absent"):
     _restore(tmp_path, 1, dataclasses.replace(state, absent=jnp.zeros(2)))
 
 
 def test_missing_and_broken_checkpoints_are_refused_in_one_line(tmp_path: Path):
   assert checkpoint_reader.latest_step(tmp_path) is None
-  with pytest.raises(ConfigError, match="has no checkpoint"):
+  with pytest.raises(UserError, match="has no checkpoint"):
     _restore(tmp_path, None, _state())
   _save(tmp_path, (1, _state(1), None), (2, _state(2), None))
-  with pytest.raises(ConfigError, match="no checkpoint 3; choose from 1, 2"):
+  with pytest.raises(UserError, match="no checkpoint 3; choose from 1, 2"):
     _restore(tmp_path, 3, _state())
   folder = tmp_path / "checkpoints"
   shutil.rmtree(folder / "2" / "state" / "d")
-  with pytest.raises(ConfigError, match="checkpoint 2 of .* cannot be read") as error:
+  with pytest.raises(UserError, match="checkpoint 2 of .* cannot be read") as error:
     _restore(tmp_path, 2, _state())
   assert "\n" not in str(error.value)
   # What was cut off while being written is not taken for a checkpoint.
@@ -235,7 +235,7 @@ def test_missing_and_broken_checkpoints_are_refused_in_one_line(tmp_path: Path):
 def test_another_format_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
   _save(tmp_path, (1, _state(), None))
   monkeypatch.setattr(checkpoint_record, "SCHEMA_VERSION", 9)
-  with pytest.raises(ConfigError, match="has format 2; this code reads 9"):
+  with pytest.raises(UserError, match="has format 2; this code reads 9"):
     _restore(tmp_path, 1, _state())
 
 
@@ -342,7 +342,7 @@ def test_without_a_whole_checkpoint_each_is_named(tmp_path: Path):
     path.write_text(
       path.read_text().replace('"success_rate": null', '"success_rate": 1')
     )
-  with pytest.raises(ConfigError, match="checkpoint 2 .* damaged.*checkpoint 1 .* dam"):
+  with pytest.raises(UserError, match="checkpoint 2 .* damaged.*checkpoint 1 .* dam"):
     _restore(tmp_path, None, _state())
 
 
@@ -377,7 +377,7 @@ import itertools, pathlib, sys
 sys.path.insert(0, sys.argv[2])
 import test_checkpoint as t
 run = pathlib.Path(sys.argv[1])
-first = (t.checkpoint.latest_step(run) or 0) + 1
+first = (t.checkpoint_reader.latest_step(run) or 0) + 1
 with t.CheckpointWriter(run, t.CONFIG, keep=2) as writer:
   for step in itertools.count(first):
     writer.save(step, {"state": t._state(step % 7, images=200_000)})

@@ -20,7 +20,7 @@ import pytest
 from scipy import stats
 from tensorboardX.proto import event_pb2
 
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import UserError
 from apnpql_jax.runs import metrics
 from apnpql_jax.runs.progress import TrainProgress
 from apnpql_jax.runs.sinks import check_sinks, make_sinks
@@ -144,7 +144,7 @@ def test_a_damaged_record_is_refused(tmp_path: Path):
   path = tmp_path / "metrics.jsonl"
   for text in ("oops\n", '{"a": 1}\n', "[1]\n", '{"step": "x"}\n'):
     path.write_text('{"step": 1}\n' + text)
-    with pytest.raises(ConfigError, match=r"metrics.jsonl, line 2: not a row"):
+    with pytest.raises(UserError, match=r"metrics.jsonl, line 2: not a row"):
       metrics.MetricWriter(tmp_path)
     assert path.read_text().endswith(text)
 
@@ -183,7 +183,7 @@ def test_tensorboard_holds_every_number(tmp_path: Path):
 
 
 def test_extras_that_are_unknown_or_missing_are_named(monkeypatch: pytest.MonkeyPatch):
-  with pytest.raises(ConfigError, match="choose from tensorboard, wandb"):
+  with pytest.raises(UserError, match="choose from tensorboard, wandb"):
     check_sinks(["tensorflow"])
   for name, package, extra in (
     ("tensorboard", "tensorboardX", "tb"),
@@ -191,7 +191,7 @@ def test_extras_that_are_unknown_or_missing_are_named(monkeypatch: pytest.Monkey
   ):
     monkeypatch.delitem(sys.modules, package, raising=False)
     monkeypatch.setattr(sys, "path", [])  # As if nothing were installed.
-    with pytest.raises(ConfigError, match=rf"{package}, .*apnpql-jax\[{extra}\]"):
+    with pytest.raises(UserError, match=rf"{package}, .*apnpql-jax\[{extra}\]"):
       check_sinks([name])
   check_sinks([])
 

@@ -13,7 +13,7 @@ import jax
 import pytest
 
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import UserError
 from apnpql_jax.runs import run_folder, text, versions
 from apnpql_jax.runs.versions import changed_versions
 
@@ -78,7 +78,7 @@ def test_a_run_is_replaced_only_when_asked(tmp_path: Path):
   run_folder.create(run, CONFIG)
   (run / "metrics.csv").write_text("step\n")
   other = dataclasses.replace(CONFIG, seed=4)
-  with pytest.raises(ConfigError, match="holds a run") as error:
+  with pytest.raises(UserError, match="holds a run") as error:
     run_folder.create(run, other)
   assert "\n" not in str(error.value)
   assert run_folder.open_run(run).config == CONFIG and (run / "metrics.csv").exists()
@@ -92,9 +92,9 @@ def test_a_folder_that_is_no_run_is_never_removed(tmp_path: Path):
   thesis = tmp_path / "thesis.txt"
   thesis.write_text("years of work")
   for overwrite in (False, True):
-    with pytest.raises(ConfigError, match="not a run"):
+    with pytest.raises(UserError, match="not a run"):
       run_folder.create(tmp_path, CONFIG, overwrite=overwrite)
-  with pytest.raises(ConfigError, match="not a folder"):
+  with pytest.raises(UserError, match="not a folder"):
     run_folder.create(thesis, CONFIG, overwrite=True)
   assert thesis.read_text() == "years of work"
   empty = tmp_path / "empty"
@@ -104,12 +104,12 @@ def test_a_folder_that_is_no_run_is_never_removed(tmp_path: Path):
 
 def test_what_is_no_run_is_not_opened(tmp_path: Path):
   for path in (tmp_path, tmp_path / "missing"):
-    with pytest.raises(ConfigError, match="not a run folder") as error:
+    with pytest.raises(UserError, match="not a run folder") as error:
       run_folder.open_run(path)
     assert "\n" not in str(error.value)
   folder = run_folder.create(tmp_path / "run", CONFIG)
   (folder.path / "config.json").write_text('{"seed": 1}')
-  with pytest.raises(ConfigError, match=r"config.json: .*missing"):
+  with pytest.raises(UserError, match=r"config.json: .*missing"):
     run_folder.open_run(folder.path)
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from apnpql_jax.config.files import config_to_json
 from apnpql_jax.config.schema import AgentConfig, TrainConfig
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import ConfigError, UserError
 from apnpql_jax.runs import run_folder
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -52,18 +52,18 @@ def test_a_run_made_before_a_setting_came_is_read_and_that_is_said(tmp_path):
   # It is resumed as it was, and only so.
   run_folder.check_resumable(run, config)
   blocks = dataclasses.replace(config.agent, residual_blocks=1)
-  with pytest.raises(ConfigError, match="agent.residual_blocks 0 -> 1"):
+  with pytest.raises(UserError, match="agent.residual_blocks 0 -> 1"):
     run_folder.check_resumable(run, dataclasses.replace(config, agent=blocks))
   del data["agent"]["n_step"]
   (run / "config.json").write_text(json.dumps(data))
-  with pytest.raises(ConfigError, match="config.json: .*'agent.n_step' is missing"):
+  with pytest.raises(UserError, match="config.json: .*'agent.n_step' is missing"):
     run_folder.load_run_config(run, pytest.fail)
 
 
 def test_configuration_that_is_not_text_is_refused(tmp_path):
   write_run(tmp_path / "a")
   (tmp_path / "a" / "config.json").write_bytes(b"\xff\xfe\x00")
-  with pytest.raises(ConfigError, match="config.json"):
+  with pytest.raises(UserError, match="config.json"):
     run_folder.load_run_config(tmp_path / "a")
 
 
@@ -77,7 +77,7 @@ def test_resume_may_change_only_what_does_not_alter_learning(tmp_path):
   fixed = {f.name for f in dataclasses.fields(TrainConfig)} - set(run_folder.MAY_CHANGE)
   for name in fixed - {"env", "agent", "replay"}:
     changed = {name: getattr(TrainConfig(), name) + 1}
-    with pytest.raises(ConfigError, match=name):
+    with pytest.raises(UserError, match=name):
       run_folder.check_resumable(run, dataclasses.replace(TrainConfig(), **changed))
 
 
@@ -89,7 +89,7 @@ def test_a_run_that_is_trained_is_left_alone(tmp_path):
       lambda: run_folder.check_free(run, overwrite=True),
       lambda: run_folder.lock(run).__enter__(),
     ):
-      with pytest.raises(ConfigError, match="run' is trained by another process"):
+      with pytest.raises(UserError, match="run' is trained by another process"):
         refused()
     run_folder.load_run_config(run)
   run_folder.check_resumable(run, TrainConfig())
@@ -102,7 +102,7 @@ def test_a_run_that_is_trained_is_left_alone(tmp_path):
   command = [sys.executable, "-c", code, str(run)]
   with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as process:
     assert process.stdout is not None and process.stdout.readline()
-    with pytest.raises(ConfigError, match="another process"):
+    with pytest.raises(UserError, match="another process"):
       run_folder.check_free(run, overwrite=True)
     process.kill()
   run_folder.check_free(run, overwrite=True)
@@ -114,12 +114,12 @@ def test_only_a_run_can_be_overwritten(tmp_path):
   run_folder.check_free(tmp_path / "empty", overwrite=False)
   run = write_run(tmp_path / "run")
   run_folder.check_free(run, overwrite=True)
-  with pytest.raises(ConfigError, match="--overwrite"):
+  with pytest.raises(UserError, match="--overwrite"):
     run_folder.check_free(run, overwrite=False)
   (tmp_path / "link").symlink_to(run, target_is_directory=True)
   (run / "config.json").rename(tmp_path / "elsewhere.json")
   for folder in (run, tmp_path, tmp_path / "link", tmp_path / "elsewhere.json"):
-    with pytest.raises(ConfigError):
+    with pytest.raises(UserError):
       run_folder.check_free(folder, overwrite=True)
 
 
@@ -165,7 +165,7 @@ def test_stopped_run_is_kept_and_the_old_one_removed(tmp_path, stop):
 def test_folder_that_cannot_be_made_is_refused(tmp_path):
   (tmp_path / "file").write_text("")
   with (
-    pytest.raises(ConfigError, match="cannot make run folder"),
+    pytest.raises(UserError, match="cannot make run folder"),
     run_folder.fresh_run_dir(tmp_path / "file" / "run"),
   ):
     pass

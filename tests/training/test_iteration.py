@@ -24,7 +24,7 @@ from apnpql_jax.cli import main
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.data import replay
 from apnpql_jax.envs.env import Env, make_env
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import UserError
 from apnpql_jax.runs import checkpoint_reader, leaves, run_folder
 from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
 from apnpql_jax.training import faults, resume
@@ -319,5 +319,5 @@ def test_after_several_the_run_stops_and_the_update_can_be_repeated(
   np.savez(file, **(arrays | zeros))
   assert not any(faults.repeat(file).values())
   np.savez(file, **{k: v for k, v in arrays.items() if k != "key"})
-  with pytest.raises(ConfigError, match="no update of this run: 'key'"):
+  with pytest.raises(UserError, match="no update of this run: 'key'"):
     faults.repeat(file)

@@ -33,7 +33,7 @@ from apnpql_jax.cli import main
 from apnpql_jax.config.checks import validate
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.envs.env import make_env
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import UserError
 from apnpql_jax.runs import checkpoint_reader, leaves, run_folder
 from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
 from apnpql_jax.training import resume
@@ -190,7 +190,7 @@ def assert_same(run: Path, single: Path) -> None:
   [(3, "env.worlds=32 must be a multiple of the 3 devices"), (64, "env.worlds=32")],
 )
 def test_what_cannot_be_split_is_refused(devices, message):
-  with pytest.raises(ConfigError, match=re.escape(message)):
+  with pytest.raises(UserError, match=re.escape(message)):
     validate(TrainConfig(), devices=devices)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from apnpql_jax.config.schema import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import UserError
 from apnpql_jax.runs import checkpoint_reader, run_folder
 from apnpql_jax.training.evaluate import evaluate
 from apnpql_jax.training.train import train
@@ -97,7 +97,7 @@ def test_resume_refuses_other_settings(finished):
   other = dataclasses.replace(
     CONFIG, agent=dataclasses.replace(CONFIG.agent, gamma=0.9)
   )
-  with pytest.raises(ConfigError, match=r"agent\.gamma 0\.99 -> 0\.9"):
+  with pytest.raises(UserError, match=r"agent\.gamma 0\.99 -> 0\.9"):
     train(other, run_dir, resume=True)
 
 
