@@ -54,7 +54,7 @@ def python(site: Path, cwd: Path, *args: str) -> str:
 
 
 def locked(name: str) -> dict[str, str]:
-  """Normalised name -> version of a lock file."""
+  """Normalized name -> version of a lock file."""
   pairs = [line.split("==") for line in (ROOT / name).read_text().splitlines()]
   return {canonicalize_name(package): version for package, version in pairs}
 

@@ -90,7 +90,7 @@ class Heads:
     return flat.reshape(*self.phi.shape[:-1], NUM_PRIMITIVES, ACTION_DIM)
 
   def prior(self) -> GripperGMM:
-    """Behaviour prior b_theta; its gradient reaches the bp group alone.
+    """Behavior prior b_theta; its gradient reaches the bp group alone.
 
     Means are the predicted primitives within the action box (paper Sec. IV-A). The
     M-step trains what is left of theta and must move neither them nor phi.

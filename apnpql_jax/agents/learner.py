@@ -209,8 +209,8 @@ def _candidates(
   *,
   greedy: bool = False,
 ) -> Candidates:
-  """The policy of these heads, which are their own past if the regulariser asks."""
-  prior = algorithm.regulariser(heads, heads)
+  """The policy of these heads, which are their own past if the regularizer asks."""
+  prior = algorithm.regularizer(heads, heads)
   return algorithm.policy(heads, prior, key, num_samples=num_samples, greedy=greedy)
 
 
@@ -241,7 +241,7 @@ def total_loss(
   slow = networks.at(target_params, batch.observation_tm1)
   predicted = heads.primitives()
   outputs = heads.z(batch.action_tm1[None])[0]
-  prior = algorithm.regulariser(heads, slow)
+  prior = algorithm.regularizer(heads, slow)
   improved = algorithm.policy_update(heads, prior, key)
   candidates = improved.candidates
   q_values, weights = candidates.q_values, improved.weights
@@ -249,7 +249,7 @@ def total_loss(
     "loss/ap": losses.ap_loss(predicted, batch.primitives_tm1, delta=config.ap_delta),
     "loss/q": evaluation.loss(outputs, target),
     **improved.losses,
-    **algorithm.regulariser_update(heads, prior, candidates, batch, key, trained["nu"]),
+    **algorithm.regularizer_update(heads, prior, candidates, batch, key, trained["nu"]),
   }
   per_state = terms | {
     **_ap_errors(predicted, batch.primitives_tm1),

@@ -22,7 +22,7 @@ def weighted_mean(losses: Array, weight: Array) -> Array:
 
 
 def ap_loss(predicted: Array, label: Array, *, delta: float) -> Array:
-  """Behaviour cloning of the action primitives, L^ap (paper Eq. 10).
+  """Behavior cloning of the action primitives, L^ap (paper Eq. 10).
 
   Velocities by a Huber loss: quadratic below ``delta`` (rad/s), where the arm closes in
   on its target, and linear above, where labels of distant targets saturate. Gripper
@@ -104,7 +104,7 @@ def retrace_target(
 
 
 def alpha_loss(q_tm1: Array, alpha_tm1: Array, *, epsilon: float) -> Array:
-  """Dual of the KL limit, to be minimised over alpha(s) (paper Eq. 7).
+  """Dual of the KL limit, to be minimized over alpha(s) (paper Eq. 7).
 
   Args:
     q_tm1: f32[S, *b] values of candidates drawn from the prior; not trained.
@@ -176,7 +176,7 @@ def m_step_loss(
 def nu_loss(nu: Array, entropy: Array, *, epsilon_nu: float) -> Array:
   """Dual of the entropy floor, nu (H(b) - epsilon_nu) (text below paper Eq. 9).
 
-  Minimised over nu >= 0: nu grows while the entropy is below its floor.
+  Minimized over nu >= 0: nu grows while the entropy is below its floor.
 
   Args:
     nu: f32[].

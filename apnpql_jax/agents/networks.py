@@ -1,7 +1,7 @@
 """What the networks say of a batch of states (paper Fig. 2 and Sec. IV-B).
 
 The features phi are computed once per observation and reused for every candidate
-action. Parameters live in groups, so that each can have its own optimiser: encoder,
+action. Parameters live in groups, so that each can have its own optimizer: encoder,
 ap (predicted primitives), z (value), alpha; where the algorithm has them also bp (the
 rest of the prior) and policy.
 """

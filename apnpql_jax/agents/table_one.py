@@ -43,14 +43,14 @@ from apnpql_jax.errors import ConfigError, check_name
 class Algorithm:
   """One row of Table I; the columns are functions."""
 
-  regulariser: Callable[..., ActionDistribution]
+  regularizer: Callable[..., ActionDistribution]
   """b: (heads, target network's heads) -> distribution the policy is kept close to."""
 
   policy: Callable[..., Candidates]
   """What acts and is evaluated: (heads, b, key, num_samples, greedy) -> weighted
   candidates."""
 
-  regulariser_update: Callable[..., Losses]
+  regularizer_update: Callable[..., Losses]
   """(heads, b, candidates, batch, key, nu) -> losses of b and nu; the candidates are
   those of the improved policy."""
 
@@ -63,7 +63,7 @@ class Algorithm:
   def groups(self, config: AgentConfig) -> tuple[str, ...]:
     """Parameter groups that the columns read, in the order of ``GROUPS``."""
     absent = {
-      "bp": self.regulariser is not behavior_prior,
+      "bp": self.regularizer is not behavior_prior,
       "policy": self.policy is not parametric,
       "alpha": config.temperature == "fixed",
     }
@@ -71,7 +71,7 @@ class Algorithm:
 
 
 ALGORITHMS = {
-  # regulariser      policy          regulariser       policy      policy
+  # regularizer      policy          regularizer       policy      policy
   #                                  update            update      evaluation
   "ap_npql": Algorithm(
     behavior_prior, non_parametric, fit_candidates,   none,       Categorical,
@@ -118,8 +118,8 @@ def algorithm_of(config: AgentConfig) -> Algorithm:
   """
   check_name("agent.algorithm", config.algorithm, tuple(ALGORITHMS))
   row = ALGORITHMS[config.algorithm]
-  if config.regulariser == "uniform":
-    row = dataclasses.replace(row, regulariser=uniform, regulariser_update=no_update)
+  if config.regularizer == "uniform":
+    row = dataclasses.replace(row, regularizer=uniform, regularizer_update=no_update)
   if config.policy_evaluation != "row":
     evaluation = EVALUATIONS[config.policy_evaluation]
     row = dataclasses.replace(row, policy_evaluation=evaluation)

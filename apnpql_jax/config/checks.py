@@ -150,7 +150,7 @@ def _validate_env(env: EnvConfig) -> None:
 
 def _validate_agent(agent: AgentConfig) -> None:
   check_name("agent.temperature", agent.temperature, TEMPERATURES)
-  check_name("agent.regulariser", agent.regulariser, REGULARIZERS)
+  check_name("agent.regularizer", agent.regularizer, REGULARIZERS)
   check_name("agent.policy_evaluation", agent.policy_evaluation, EVALUATIONS)
   check_name("agent.prior_mean", agent.prior_mean, PRIOR_MEANS)
   check_name("agent.global_features", agent.global_features, IMAGE_FEATURES)

@@ -18,6 +18,10 @@ _BEFORE = "before"
 """In the metadata of a field: its value in texts that were written without it."""
 
 
+_FORMERLY = "formerly"
+"""In the metadata of a field: its name in older texts."""
+
+
 def added(default: Any, *, before: Any = None) -> Any:
   """A field that came when texts without it existed.
 
@@ -27,6 +31,16 @@ def added(default: Any, *, before: Any = None) -> Any:
   """
   before = default if before is None else before
   return dataclasses.field(default=default, metadata={_BEFORE: before})
+
+
+def renamed(default: Any, *, formerly: str) -> Any:
+  """A field that had another name in older texts.
+
+  Args:
+    default: its default.
+    formerly: the name that ``from_json`` still accepts.
+  """
+  return dataclasses.field(default=default, metadata={_FORMERLY: formerly})
 
 
 def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -79,6 +93,8 @@ def _build(cls: type[Any], data: Any, path: str, lacking: list[str]) -> Any:
     raise ConfigError(f"config field {path or 'top level'} must be an object")
   prefix = path + "." if path else ""
   hints = get_type_hints(cls)
+  new_names = {f.metadata.get(_FORMERLY): f.name for f in dataclasses.fields(cls)}
+  data = {new_names.get(key, key): value for key, value in data.items()}
   for key in data:
     if key not in hints:
       raise ConfigError(

@@ -1,4 +1,4 @@
-"""Ranges of domain randomisation (paper Sec. V-C): settings, and how far they may go.
+"""Ranges of domain randomization (paper Sec. V-C): settings, and how far they may go.
 
 Part of the configuration, hence without JAX; ``worlds`` draws within them.
 """
@@ -43,7 +43,7 @@ class RandomizationConfig:
 
   texture: float = 0.2
   """Checkers and noise on robot, table, background and each object: largest change of a
-  colour, of 1. A third each are plain, checkered and noisy."""
+  color, of 1. A third each are plain, checkered and noisy."""
 
   light_turn: float = 0.4
   """Direction of the light, each component of its unit vector."""

@@ -53,7 +53,7 @@ class EnvConfig:
   """Every episode has a world of its own, within the ranges of `randomization`."""
 
   randomization: RandomizationConfig = codec.added(RandomizationConfig())
-  """Ranges of domain randomisation, in effect with `randomize`."""
+  """Ranges of domain randomization, in effect with `randomize`."""
 
   @property
   def episode_steps(self) -> int:
@@ -117,7 +117,7 @@ class AgentConfig:
   """How the limit is kept: an alpha for each state, one shared by all states (the limit
   then holds on average), or fixed at initial_alpha (the limit is not kept)."""
 
-  regulariser: str = "row"
+  regularizer: str = codec.renamed("row", formerly="regulariser")
   """What the policy is kept close to: row (as in Table I) or uniform (no prior)."""
 
   policy_evaluation: str = "row"
@@ -134,13 +134,13 @@ class AgentConfig:
   """Entropy floor of the prior in nats."""
 
   lambda_ap: float = 10.0
-  """Weight of the behaviour-cloning loss of the action primitives."""
+  """Weight of the behavior-cloning loss of the action primitives."""
 
   feature_dim: int = 256
   """Size of the shared feature vector phi."""
 
   max_grad_norm: float = 10.0
-  """Gradients are scaled down to this global norm, each optimiser by itself."""
+  """Gradients are scaled down to this global norm, each optimizer by itself."""
 
   patch_channels: int = 32
   """Channels of the first convolution (4x4 patches) of each camera."""
@@ -171,7 +171,7 @@ class AgentConfig:
   they stay as they are."""
 
   color_jitter: float = codec.added(0.0)
-  """Colour channels of the images of a batch are multiplied at random by factors this
+  """Color channels of the images of a batch are multiplied at random by factors this
   close to 1; 0: they stay as they are."""
 
   ap_delta: float = 0.1

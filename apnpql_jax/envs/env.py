@@ -95,7 +95,7 @@ class Env:
     return self._bank.rows - self.bank_split
 
   def reset(self, rows: Array) -> EnvState:
-    """Starts one world per bank row; a row always has the same randomisation.
+    """Starts one world per bank row; a row always has the same randomization.
 
     Args:
       rows: i32[worlds].

@@ -48,7 +48,7 @@ class World:
     self.fields = dict(fields)
 
   def __getitem__(self, name: str) -> Array:
-    """A model field or the colour of the background, f32[...]."""
+    """A model field or the color of the background, f32[...]."""
     value = self.fields.get(name)
     if value is None:
       plain = Lighting() if name == "background" else self.model

@@ -1,4 +1,4 @@
-"""Colours, textures and light of a world."""
+"""Colors, textures and light of a world."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WAVES = (0.02, 0.3)
 
 
 def color(draw: Draw, world: World) -> None:
-  """Changes the colours of robot, table, objects and background, each by itself."""
+  """Changes the colors of robot, table, objects and background, each by itself."""
   if not draw.config.color:
     return
   change = draw.uniform("color", (world.model.nbody + 1, 3))
@@ -70,7 +70,7 @@ def light(draw: Draw, world: World) -> None:
     ambient, diffuse = draw.share("light_level", (2,)) * jnp.asarray(
       [plain.ambient, plain.diffuse], jnp.float32
     )
-    # No brighter than all there is: colours would be cut off.
+    # No brighter than all there is: colors would be cut off.
     most = jnp.maximum(1.0, ambient + diffuse)
     world["light_ambient"] = ambient / most * ones
     world["light_diffuse"] = diffuse / most * ones

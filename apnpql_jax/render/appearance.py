@@ -23,13 +23,13 @@ FIELDS = (
   "geom_size",  # f32[*b, ngeom, 3]: MuJoCo half sizes, m
   "geom_rgba",  # f32[*b, ngeom, 4]: of which alpha does not count
   "waves",  # f32[*b, ngeom + 1, 3, 4]: see ``texture``; with them the next two
-  "odd_rgb",  # f32[*b, ngeom + 1, 3]: the other colour
+  "odd_rgb",  # f32[*b, ngeom + 1, 3]: the other color
   "grain",  # f32[*b, ngeom + 1]: share of the brightness that noise takes at most
   "light_dir",  # f32[*b, nlight, 3]: in which a light travels, of any length
   "light_ambient",  # f32[*b, nlight, 3]: intensity in the dark; the first of the three
   "light_diffuse",  # f32[*b, nlight, 3]: intensity straight below; the first, too
   "cam_fovy",  # f32[*b, ncam]: vertical field of view, degrees
-  "background",  # f32[*b, 3]: colour of rays that hit nothing
+  "background",  # f32[*b, 3]: color of rays that hit nothing
 )
 """What may differ between worlds, by MuJoCo's names and by MuJoCo's ids; where there is
 one more than geoms, the last is the background."""
@@ -39,7 +39,7 @@ class Appearance(NamedTuple):
   """One world; NumPy where it is the same in all."""
 
   sizes: Array | np.ndarray  # f32[n, 3]: of the n geoms that are drawn, m
-  palette: Array | np.ndarray  # f32[2 n + 2, 3]: geoms, background, their odd colours
+  palette: Array | np.ndarray  # f32[2 n + 2, 3]: geoms, background, their odd colors
   texture: Texture | None  # None: as in the scene file
   light: Array | np.ndarray  # f32[3, 3]: see ``shadow.light_basis``
   ambient: Array | float

@@ -38,13 +38,13 @@ class Geoms:
   types: np.ndarray
   """i32[n]: ``mujoco.mjtGeom``, sorted."""
   sizes: np.ndarray
-  """f32[n, 3]: MuJoCo half sizes in metres."""
+  """f32[n, 3]: MuJoCo half sizes in meters."""
   colors: np.ndarray
   """f32[n, 3]: red, green, blue in [0, 1]. Every visible geom is drawn opaque."""
   checker: np.ndarray
-  """f32[n]: edge of a checker's squares in metres, 0 for a plain geom."""
+  """f32[n]: edge of a checker's squares in meters, 0 for a plain geom."""
   checker_colors: np.ndarray
-  """f32[n, 3]: colour of the squares where floor(x) + floor(y) is odd."""
+  """f32[n, 3]: color of the squares where floor(x) + floor(y) is odd."""
 
   @classmethod
   def from_model(
@@ -150,9 +150,9 @@ class Lighting:
   """Intensity added where the light falls in straight."""
   fill: float = 0.3
   """Share of ``diffuse`` seen by surfaces turned straight away from the light;
-  without it they would all have one flat colour."""
+  without it they would all have one flat color."""
   background: tuple[float, float, float] = (0.55, 0.65, 0.75)
-  """Colour of rays that hit nothing, in [0, 1]."""
+  """Color of rays that hit nothing, in [0, 1]."""
   shadow_casters: tuple[int, ...] = ()
   """MuJoCo ids of the spheres, capsules and boxes that throw hard shadows. Empty
   means no shadows and no cost."""
@@ -226,7 +226,7 @@ def _texture_id(model: mujoco.MjModel, geom_id: int) -> int:
 def _read_checker(
   model: mujoco.MjModel, geom_id: int, texture: int
 ) -> tuple[float, np.ndarray, np.ndarray]:
-  """Edge in metres and the colours of even and odd squares of a checkered plane."""
+  """Edge in meters and the colors of even and odd squares of a checkered plane."""
   height, width = model.tex_height[texture], model.tex_width[texture]
   channels, start = model.tex_nchannel[texture], model.tex_adr[texture]
   data = model.tex_data[start : start + height * width * channels]

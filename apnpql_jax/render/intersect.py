@@ -45,14 +45,14 @@ class Frames(NamedTuple):
   center: Array  # f32[n, 3]: in the camera's frame, m
   offset: Array  # f32[n, 3]: the same in the geom's own frame, m
   light: Array  # f32[n, 3]: unit vector towards the light in the geom's own frame
-  center_light: Array  # f32[n]: inner product of centre and light, m
-  center_norm2: Array  # f32[n]: squared distance of the centre, m^2
+  center_light: Array  # f32[n]: inner product of center and light, m
+  center_norm2: Array  # f32[n]: squared distance of the center, m^2
   size: Array  # f32[n, 3]: MuJoCo half sizes, m
   inv_radius: Array  # f32[n]: 1 / size[0], of use where that is a radius
 
 
 def make_rays(height: int, width: int, fovy_deg: float) -> Rays:
-  """Rays through the pixel centres, row by row from the upper left."""
+  """Rays through the pixel centers, row by row from the upper left."""
   pixel = 2.0 * np.tan(np.radians(fovy_deg) / 2.0) / height
   x = (np.arange(width) + 0.5 - width / 2.0) * pixel
   y = (height / 2.0 - np.arange(height) - 0.5) * pixel
@@ -164,7 +164,7 @@ def _tube(g: Frames, rays: Rays) -> tuple[Array, Array, Array, Array, Array, Arr
   Returns:
     Entry, exit, whether it is hit at all, then what a capsule shares: inner product
     of transverse direction and offset, axial direction, and axial entry point
-    measured from the centre.
+    measured from the center.
   """
   dx, dy, dz = along(g.x, rays) + _NUDGE, along(g.y, rays), along(g.z, rays)
   inv_a = 1.0 / (dx * dx + dy * dy)

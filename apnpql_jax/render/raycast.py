@@ -2,10 +2,10 @@
 
 The layout is what makes it fast on a CPU: for an image, one expression folds over the
 geoms, unrolled, keeping per pixel the smallest depth and one float that carries the
-winner's colour index and its intensity. XLA compiles it to a single vectorised loop
+winner's color index and its intensity. XLA compiles it to a single vectorised loop
 over pixels that touches memory once, so no batch is too large for the caches. It runs
 inside a ``lax.map`` over blocks of pixels, for the fence that a loop is: without one,
-XLA fuses the fold into what uses it and casts the scene again for each colour channel
+XLA fuses the fold into what uses it and casts the scene again for each color channel
 (its CPU backend drops optimization barriers before it fuses).
 """
 
@@ -28,11 +28,11 @@ Array = jax.Array
 OUTPUTS = ("rgb", "depth", "segmentation")
 DEFAULT_LIGHTING = Lighting()
 NEAR = 0.005
-"""Default near limit in metres."""
+"""Default near limit in meters."""
 BLOCKS = 4
 """Blocks of pixels per image; one would be no loop."""
 
-_FULL = 255.0 / 256.0  # full intensity; below one, for the integer part is the colour
+_FULL = 255.0 / 256.0  # full intensity; below one, for the integer part is the color
 
 
 class Image(struct.PyTreeNode):
@@ -59,7 +59,7 @@ def render(
   outputs: Sequence[str] = OUTPUTS,
   near: float = NEAR,
 ) -> Image:
-  """Casts one ray per pixel through its centre.
+  """Casts one ray per pixel through its center.
 
   Geoms are opaque; back faces are not drawn, so a camera inside a geom sees through
   it, as in MuJoCo's renderer. What enters closer than ``near`` is not drawn either.
@@ -74,7 +74,7 @@ def render(
     lighting: light, background, shadows.
     fields: what differs between worlds, as in ``look.FIELDS``, with leading axes *b.
     outputs: which of "rgb", "depth", "segmentation" to compute; only these are paid.
-    near: smallest depth drawn, in metres.
+    near: smallest depth drawn, in meters.
 
   Returns:
     The image, with the leading axes of the poses.

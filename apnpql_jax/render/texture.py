@@ -1,9 +1,9 @@
 """Procedural textures, computed from where a ray hits a geom.
 
 Three waves run through each geom, fixed to it. Where their half waves make an odd sum
-the geom has its other colour, which gives a checker if they run along its axes; and
+the geom has its other color, which gives a checker if they run along its axes; and
 their height takes some of its brightness, which gives noise if they do not. The
-background is a sphere of one metre around the camera, fixed to the world.
+background is a sphere of one meter around the camera, fixed to the world.
 """
 
 from __future__ import annotations

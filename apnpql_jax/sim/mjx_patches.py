@@ -18,7 +18,7 @@ def patch_mjx() -> None:
 
   Kinematic chains: on the CPU, XLA's fusion duplicates the work of a parent body into
   each child: on a chain of eight bodies stock MJX is three orders of magnitude slower
-  under vmap. An optimisation barrier behind every body ends it.
+  under vmap. An optimization barrier behind every body ends it.
 
   Elliptic cones: to add up their Hessians, the solver multiplies the Jacobian by a
   dense matrix of rows x rows, of which only a block of at most 6 x 6 per contact

@@ -62,7 +62,7 @@ FREE = 0.06
 """m; lifted this high, the cup is turned and moved at full speed."""
 
 GOAL_TOLERANCE = 0.03
-"""m; the cup's centre from the goal's."""
+"""m; the cup's center from the goal's."""
 
 UPRIGHT = 0.97
 """Cosine of the largest tilt of a cup that stands: 14 degrees."""
@@ -78,7 +78,7 @@ def shape_cup(spec: mujoco.MjSpec, sides: int, half: float, height: float) -> No
   # A solid cylinder's; the wall alone would be a little more.
   side = MASS * (3 * half**2 + height**2) / 12
   cup.inertia = [side, side, MASS * half**2 / 2]
-  # A side of a regular polygon is 2 tan(pi / n) of its distance to the centre.
+  # A side of a regular polygon is 2 tan(pi / n) of its distance to the center.
   across = half * np.tan(np.pi / sides)
   for i in range(4):
     turned = sides == 4 and i % 2 == 1  # The two diagonal boxes hide in a square.
@@ -185,8 +185,8 @@ class FlipCup(TableTask):
     return self._placed(state) & at_rest & (away > CLEAR)
 
   def objects(self, state: PhysicsState) -> Array:
-    """f32[worlds, 12]: cup's centre, a point towards its mouth, the goal, and a point
-    half the cup's width beside its centre and half its height above, m."""
+    """f32[worlds, 12]: cup's center, a point towards its mouth, the goal, and a point
+    half the cup's width beside its center and half its height above, m."""
     cup = self._cup_pos(state)
     to_mouth = cup + geometry.POINTER * self._axis(state)
     width, height = self._half_width(state), self._half_height(state)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from apnpql_jax.types import Array
 
 REST_SPEED = 0.05
-"""m/s; above float32 contact noise, and slow enough to stop within a millimetre:
+"""m/s; above float32 contact noise, and slow enough to stop within a millimeter:
 v^2 / 2 mu g is 0.7 mm at mu = 0.2."""
 
 REST_TURN = 0.5
@@ -18,7 +18,7 @@ REST_TURN = 0.5
 
 POINTER = 0.2
 """m; a direction is observed as a point this far away, so that a turn by a few
-degrees weighs as much as a few centimetres."""
+degrees weighs as much as a few centimeters."""
 
 
 def norm(x: Array) -> Array:

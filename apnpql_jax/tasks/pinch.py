@@ -18,8 +18,8 @@ CLEARANCE = 0.02
 
 NEAR = 0.012
 """m; the hand may close when its pinch point is this close to where it shall grip. What
-stands freely is centred by the closing pads, and a policy that sees a pixel per
-centimetre hardly comes closer."""
+stands freely is centered by the closing pads, and a policy that sees a pixel per
+centimeter hardly comes closer."""
 
 LOST = 0.025
 """m; what is further from the pinch point is not in the hand."""
@@ -59,7 +59,7 @@ class Pinch:
       scene: gives the tool site and the finger.
       neutral_mat: f32[3, 3], the tool's rotation at heading zero.
       width: m, of what is gripped.
-      above: m, distance along the tool from where it is aimed at to the pads' centre.
+      above: m, distance along the tool from where it is aimed at to the pads' center.
       hover: m, height over the grasp at which the open finger tips clear the object.
       travel: m, tool height at which closed fingers clear everything.
       near: m, see ``NEAR``.
@@ -196,7 +196,7 @@ def finger_angle(gap: Array | float) -> Array:
 
 
 def pinch_height(gap: Array | float) -> Array:
-  """How far (m) the pads' centre lies behind the tool site at this gap.
+  """How far (m) the pads' center lies behind the tool site at this gap.
 
   The pads travel forward on an arc as the fingers close; the site is where their
   tips end when closed. Closed form of the maker's linkage.

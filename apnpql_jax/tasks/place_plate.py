@@ -40,10 +40,10 @@ THICKNESS = 0.012
 """m; of the plate."""
 
 RADIUS = 0.0647
-"""m; from the plate's centre to the middle of a side of its octagon."""
+"""m; from the plate's center to the middle of a side of its octagon."""
 
 GRASP_INSET = 0.013
-"""m from the plate's edge to the pads' centre: the pads are 20 mm long."""
+"""m from the plate's edge to the pads' center: the pads are 20 mm long."""
 
 HOVER = 0.06
 """m; height over the grasp at which the open finger tips clear the plate."""
@@ -53,7 +53,7 @@ TRAVEL = 0.22
 
 NEAR, STRAIGHT = 0.01, 0.12
 """m and rad; closer than for what stands freely: the holder keeps the plate from being
-centred and turned by the pads."""
+centered and turned by the pads."""
 
 LIFT = 0.085
 """m; how high the plate is carried, swinging: jaws and walls are 35 and 40 mm high."""
@@ -153,7 +153,7 @@ class PlacePlate(TableTask):
     return self._in_box(state) & at_rest & (distance > RADIUS - GRASP_INSET + CLEAR)
 
   def objects(self, state: PhysicsState) -> Array:
-    """f32[worlds, 12]: centre of the plate and a point on its axis, the same for the
+    """f32[worlds, 12]: center of the plate and a point on its axis, the same for the
     box and its longer side, m."""
     plate, goal = self._plate_pos(state), state.mocap_pos[:, self._goal]
     box_yaw = geometry.yaw(state.mocap_quat[:, self._goal])
@@ -192,7 +192,7 @@ class PlacePlate(TableTask):
     return self._plate_pos(state) + (RADIUS - GRASP_INSET) * top
 
   def _in_box(self, state: PhysicsState) -> Array:
-    """The plate's centre is between the walls and its lowest point at the floor."""
+    """The plate's center is between the walls and its lowest point at the floor."""
     mat = geometry.turn_z(geometry.yaw(state.mocap_quat[:, self._goal]))
     shift = self._plate_pos(state) - state.mocap_pos[:, self._goal]
     local = jnp.einsum("wji,wj->wi", mat, shift)

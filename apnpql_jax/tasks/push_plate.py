@@ -3,7 +3,7 @@
 Primitives, so that following one of them never knocks the plate over:
 
 - object: go above the plate and, through a funnel, down to its floor until the closed
-  finger tips are inside the rim; from inside, move to the plate's centre.
+  finger tips are inside the rim; from inside, move to the plate's center.
 - goal: from inside the rim, move by what the plate still lacks to the goal, so the
   plate is dragged along, the slower the less deep the tool is; from elsewhere, go
   above the goal.
@@ -38,7 +38,7 @@ GOAL_TOLERANCE = 0.03
 
 FLAT = 0.97
 """Cosine of the largest tilt of a plate that lies flat: 14 degrees. Upside down its
-centre is as low as ever, because only its floor touches the table."""
+center is as low as ever, because only its floor touches the table."""
 
 HOVER_HEIGHT = 0.08
 """m; tool height at which the finger tips clear the rim (34 mm)."""
@@ -50,10 +50,10 @@ DRAG_HEIGHT = 0.012
 """m; 6 mm above the plate's floor, the tips' sides against the rim."""
 
 LOW = 0.03
-"""m; below this the tips are behind the rim (centre line at 22 mm): dragging starts."""
+"""m; below this the tips are behind the rim (center line at 22 mm): dragging starts."""
 
 INSIDE = 0.083
-"""m; radius of the rim's centre line: a low tool closer than this is inside."""
+"""m; radius of the rim's center line: a low tool closer than this is inside."""
 
 CAPTURE = 0.06
 """m; a tool below this and within the rim goes down to drag, whatever primitive it
@@ -128,7 +128,7 @@ class PushPlate(TableTask):
     return positions, rotations, jnp.ones(positions.shape[:2])
 
   def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:
-    """The plate's centre is within 3 cm of the goal's, flat on the table, at rest."""
+    """The plate's center is within 3 cm of the goal's, flat on the table, at rest."""
     del kinematics
     distance = geometry.norm(self._plate_xy(state) - self._goal_xy(state))
     twist = state.qvel[:, self._plate_dof : self._plate_dof + 6]

@@ -47,7 +47,7 @@ LIFT = 0.05
 """m; clearance of the carried box over the blue one."""
 
 STACKED_OFF = 0.02
-"""m; success needs the centres this close: less than half a side, so it stands."""
+"""m; success needs the centers this close: less than half a side, so it stands."""
 
 STACKED_HEIGHT = 0.005
 """m; tolerance of the height difference of one side."""
@@ -66,7 +66,7 @@ class StackBox(TableTask):
     super().__init__()
     self._yellow, self._yellow_dof = self.scene.free_joint("yellow")
     self._blue, self._blue_dof = self.scene.free_joint("blue")
-    # Four millimetres above the centre, for room between fingers and table.
+    # Four millimeters above the center, for room between fingers and table.
     self._hand = Pinch(
       self.scene,
       self._neutral_mat,
@@ -129,14 +129,14 @@ class StackBox(TableTask):
     return stacked & on_table & at_rest & (geometry.norm(tool - yellow) > CLEAR)
 
   def objects(self, state: PhysicsState) -> Array:
-    """f32[worlds, 12]: of either box the centre and a point beyond the face nearest
+    """f32[worlds, 12]: of either box the center and a point beyond the face nearest
     to the world's x axis, m: boxes look the same after a quarter turn."""
     parts = []
     for address in (self._yellow, self._blue):
       angle = self._yaw(state, address)
       heading = jnp.stack([jnp.cos(angle), jnp.sin(angle), 0 * angle], -1)
-      centre = state.qpos[:, address : address + 3]
-      parts += [centre, centre + geometry.POINTER * heading]
+      center = state.qpos[:, address : address + 3]
+      parts += [center, center + geometry.POINTER * heading]
     return jnp.concatenate(parts, -1)
 
   def expert(

@@ -74,7 +74,7 @@ def film(env: Env, played: Episodes) -> list[np.ndarray]:
 def tile(views: Sequence[np.ndarray], *, gap: int = 2) -> np.ndarray:
   """Puts a large view on the left and the others in a column to its right.
 
-  The others are enlarged by whole factors, nearest neighbour, to about the same width,
+  The others are enlarged by whole factors, nearest neighbor, to about the same width,
   as far as the large view's height has room for them; what remains is black.
 
   Args:
@@ -182,7 +182,7 @@ def _encode(path: Path, frames: np.ndarray, fps: float) -> None:
   """
   height, width = frames.shape[1:3]
   raw = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {fps} -i -"
-  # Flat colours and hard edges need a rate factor below the default of 23.
+  # Flat colors and hard edges need a rate factor below the default of 23.
   coded = "-c:v libx264 -crf 10 -pix_fmt yuv420p -f mp4"
   command = [imageio_ffmpeg.get_ffmpeg_exe(), *f"-v error -y {raw} {coded}".split()]
   done = subprocess.run(

@@ -30,7 +30,7 @@ EVERYTHING = {
 """Losses of AP-NPQL, and what an update moves."""
 
 GONE = {
-  "--agent.regulariser uniform": {"loss/m", "loss/nu", "bp", "nu"},
+  "--agent.regularizer uniform": {"loss/m", "loss/nu", "bp", "nu"},
   "--agent.prior-mean learned": set(),
   "--agent.learning-rate-m 0": {"bp"},
   "--agent.learning-rate-nu 0": {"nu"},

@@ -1,4 +1,4 @@
-"""Random shifts and colour jitter against loops in NumPy."""
+"""Random shifts and color jitter against loops in NumPy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The agent of the row ap_npql: optimisers, targets, determinism, learning."""
+"""The agent of the row ap_npql: optimizers, targets, determinism, learning."""
 
 from __future__ import annotations
 
@@ -90,12 +90,12 @@ def test_nu_never_falls_below_zero(agent):
 
 def test_m_step_waits_for_its_delay():
   groups = ("encoder", "bp", "policy")
-  optimiser = make_optimizer(dataclasses.replace(CONFIG, m_step_delay=2), groups)
+  optimizer = make_optimizer(dataclasses.replace(CONFIG, m_step_delay=2), groups)
   trained = dict.fromkeys((*groups, "nu"), jnp.ones(3))
-  opt_state = optimiser.init(trained)
+  opt_state = optimizer.init(trained)
   moved = []
   for _ in range(3):
-    steps, opt_state = optimiser.update(trained, opt_state, trained)
+    steps, opt_state = optimizer.update(trained, opt_state, trained)
     after = jax.tree.map(jnp.add, trained, steps)
     moved.append({k for k in trained if np.any(after[k] != trained[k])})
   assert moved == [set(trained) - {"bp"}] * 2 + [set(trained)]

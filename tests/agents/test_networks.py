@@ -163,7 +163,7 @@ def test_an_lstm_reads_what_would_be_phi_of_each_instant():
 def test_a_keypoint_is_where_its_channel_peaks(parts: int):
   scores = jnp.zeros((3, 4, parts, 2)).at[2, 1, parts - 1, 0].set(100.0)
   points = encoder.keypoints(scores.at[0, 3, 0, 1].set(100.0)).reshape(2, 2)
-  # Centres of the cells, or of their last and first quarters.
+  # Centers of the cells, or of their last and first quarters.
   off = 0.25 if parts == 4 else 0.0
   expected = [[(2.5 + off) / 1.5 - 1, (1.5 + off) / 2 - 1]]
   expected += [[(0.5 - off) / 1.5 - 1, (3.5 - off) / 2 - 1]]
@@ -196,7 +196,7 @@ def test_points_are_seen_from_the_tool_in_detail_where_they_are_near():
   np.testing.assert_allclose(seen, expected, atol=1e-5)
 
 
-def test_features_tell_a_centimetre_near_the_tool():
+def test_features_tell_a_centimeter_near_the_tool():
   networks = all_networks()
   seen = observation(1, pixels=False, objects=True)
   params = jax.jit(networks.init)(jax.random.key(0), seen)
@@ -257,10 +257,10 @@ def test_value_head_is_a_plain_network_of_features_and_action():
     jnp.asarray(rng.integers(0, 2, (5, 3)), jnp.float32)
   )
   z = jax.tree.map(lambda x: np.asarray(x, np.float64), params["z"])
-  centred = np.asarray(actions) * np.array([1.0] * 6 + [2.0]) - np.array(
+  centered = np.asarray(actions) * np.array([1.0] * 6 + [2.0]) - np.array(
     [0.0] * 6 + [1.0]
   )
-  both = np.concatenate([np.broadcast_to(phi, (5, 3, 20)), centred], axis=-1)
+  both = np.concatenate([np.broadcast_to(phi, (5, 3, 20)), centered], axis=-1)
   kernel = np.concatenate([z["phi"]["kernel"], z["action"]["kernel"]])
   x = np.maximum(both @ kernel + z["phi"]["bias"], 0.0)
   x = np.maximum(x @ z["Dense_0"]["kernel"] + z["Dense_0"]["bias"], 0.0)
@@ -369,7 +369,7 @@ def test_a_limit_lets_the_gradient_back_in():
   np.testing.assert_array_equal(pull(-jnp.ones(5))[0], [-1, -1, -1, 0, 0])
 
 
-def test_prior_is_centred_on_the_primitives_within_the_action_box():
+def test_prior_is_centered_on_the_primitives_within_the_action_box():
   networks = all_networks()
   seen = observation(4, pixels=False)
   params = jax.jit(networks.init)(jax.random.key(0), seen)

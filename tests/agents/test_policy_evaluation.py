@@ -80,7 +80,7 @@ def test_retrace_over_windows_is_the_sum_over_its_definition(algorithm: str):
   window = batch.window
   assert window is not None
   heads = agent.networks.at(params, window.timestep.observation)
-  policy = row.policy(heads, row.regulariser(heads, heads), key, num_samples=6)
+  policy = row.policy(heads, row.regularizer(heads, heads), key, num_samples=6)
   values = np.sum(policy.weights * policy.q_values, axis=0)
   q = heads.q(window.action[None])
   if algorithm == "svg_prior":

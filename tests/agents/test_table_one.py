@@ -49,7 +49,7 @@ TRAINS = {
 class Columns(NamedTuple):
   """A row of docs/algorithm.md, section 3."""
 
-  regulariser: str
+  regularizer: str
   policy: str
   fitted_to: str | None
   kl: str
@@ -137,9 +137,9 @@ def test_settings_name_every_evaluation():
   assert {"row", *table_one.EVALUATIONS} == set(checks.EVALUATIONS)
 
 
-def regulariser_of(name: str, heads: Heads, slow: Heads) -> ActionDistribution:
+def regularizer_of(name: str, heads: Heads, slow: Heads) -> ActionDistribution:
   kinds = {"b": heads.prior, "uniform": lambda: UniformBox((BATCH,), 6)}
-  return {**kinds, "past": slow.policy}[COLUMNS[name].regulariser]()
+  return {**kinds, "past": slow.policy}[COLUMNS[name].regularizer]()
 
 
 def log_prob(distribution: ActionDistribution, actions: Array) -> np.ndarray:
@@ -158,7 +158,7 @@ def values(heads: Heads, actions: Array) -> np.ndarray:
 
 
 def of_q(heads: Heads, prior: ActionDistribution, key: Array):
-  """Draws of the regulariser, and their weights under q (Eq. 6)."""
+  """Draws of the regularizer, and their weights under q (Eq. 6)."""
   samples = prior.sample(key, SMALL.policy_samples)
   return samples, special.softmax(values(heads, samples) / heads.alpha(), axis=0)
 
@@ -185,7 +185,7 @@ def of_good(heads: Heads, actions: Array, key: Array):
 def test_losses_are_those_of_the_candidates_that_the_row_names(name: str):
   example, columns = example_of(name), COLUMNS[name]
   heads, (_, metrics) = example.heads(example.trained), example.learn(example.batch)[1]
-  prior = regulariser_of(name, heads, example.heads(example.slow))
+  prior = regularizer_of(name, heads, example.heads(example.slow))
   entropy = prior.entropy_bound()
   assert metrics["prior/entropy"] == pytest.approx(float(entropy.mean()), rel=1e-4)
   expected = {}

@@ -105,7 +105,7 @@ def test_every_field_has_a_docstring():
     ("agent.epsilon", float("nan"), ["finite"]),
     ("agent.epsilon", 0.0, ["positive"]),
     ("agent.temperature", "none", ["state", "shared", "fixed"]),
-    ("agent.regulariser", "b", ["row", "uniform"]),
+    ("agent.regularizer", "b", ["row", "uniform"]),
     ("agent.policy_evaluation", "mc", ["row", "retrace"]),
     ("agent.prior_mean", "zero", ["primitives", "learned"]),
     ("agent.policy_initial_std", 2.0, ["agent.policy_max_std"]),
@@ -197,7 +197,7 @@ def test_a_replay_must_hold_what_an_lstm_looks_back_on():
     validate(replaced(config, ["agent", "lstm_instants"], 5))
 
 
-def test_demonstrations_do_not_show_randomised_worlds():
+def test_demonstrations_do_not_show_randomized_worlds():
   config = TrainConfig(
     env=EnvConfig(randomize=True), replay=ReplayConfig(demonstrations="mine.npz")
   )
@@ -278,6 +278,13 @@ def test_a_setting_that_came_later_is_as_before_where_it_is_missing():
   assert config_from_json(json.dumps(data | {"agent": old}), said.append)
   assert said[0].endswith("agent.image_shift 0, agent.color_jitter 0.0")
   assert config_from_json(config_to_json(TrainConfig()), pytest.fail)
+
+
+def test_a_renamed_setting_is_read_under_its_former_name():
+  config = replaced(TrainConfig(), ["agent", "regularizer"], "uniform")
+  text = config_to_json(config)
+  assert '"regularizer": "uniform"' in text
+  assert config_from_json(text.replace("regularizer", "regulariser")) == config
 
 
 def test_any_other_setting_that_is_missing_is_refused_by_name():

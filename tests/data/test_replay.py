@@ -166,7 +166,7 @@ def _until_end(step: TimeStep, t: int, w: int, n_step: int) -> list[int]:
 
 def test_windows_are_the_slots_after_the_start_across_the_seam():
   stream = _stream(48, WORLDS, 0.2, seed=4)
-  replay = _fill(stream, length=32, chunk=16)  # Newest and oldest slot are neighbours.
+  replay = _fill(stream, length=32, chunk=16)  # Newest and oldest slot are neighbors.
   draw = functools.partial(rb.sample, replay, jax.random.key(0))
   draw = functools.partial(draw, batch_size=64, n_step=4, gamma=GAMMA)
   batch = jax.device_get(draw(windows=True))
@@ -195,7 +195,7 @@ def _up_to(step: TimeStep, t: int, w: int, instants: int) -> list[int]:
 def test_observations_of_several_instants_are_of_one_episode(instants: int):
   stream = _stream(48, WORLDS, 0.2, seed=4)
   step = stream.timestep
-  replay = _fill(stream, length=32, chunk=16)  # Newest and oldest slot are neighbours.
+  replay = _fill(stream, length=32, chunk=16)  # Newest and oldest slot are neighbors.
   batch = jax.device_get(
     rb.sample(
       replay,

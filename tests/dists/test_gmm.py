@@ -1,4 +1,4 @@
-"""The behaviour prior against scipy's densities and numerical integration."""
+"""The behavior prior against scipy's densities and numerical integration."""
 
 from __future__ import annotations
 

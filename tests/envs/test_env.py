@@ -182,7 +182,7 @@ def test_tool_is_where_the_joints_put_it(env):
 
 
 def test_pixels_show_the_task(env, pixel_chunk):
-  """Plate, goal and gripper are in the images in their colours, at the right size."""
+  """Plate, goal and gripper are in the images in their colors, at the right size."""
   observation = pixel_chunk.timestep.observation
   assert observation.global_image.shape == (12, 4, 72, 96, 3)
   assert observation.wrist_image.shape == (12, 4, 36, 64, 3)

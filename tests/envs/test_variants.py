@@ -91,7 +91,7 @@ def test_each_cup_stands_on_its_own_height(moved):
 
 
 def test_worlds_change_their_shapes_without_recompilation(state, fall, moved):
-  """Each world is what its neighbour was, of another shape."""
+  """Each world is what its neighbor was, of another shape."""
   after = fall(jax.tree.map(lambda x: jnp.roll(x, 1, axis=0), state))
   np.testing.assert_allclose(after, np.roll(moved, 1, axis=0), atol=1e-6)
 

@@ -144,7 +144,7 @@ def test_what_is_drawn_fills_its_range_and_differs_between_worlds(task, drawn):
   assert light.max() <= 1.0 + 1e-6
 
 
-def test_geoms_of_the_robot_change_their_colour_together(task, drawn):
+def test_geoms_of_the_robot_change_their_color_together(task, drawn):
   model = task.scene.model
   change = np.asarray(drawn.fields["geom_rgba"])[0] - model.geom_rgba
   arm_geoms = [model.geom(name).id for name in ("base", "forearm", "wrist_2")]
@@ -209,7 +209,7 @@ def test_objects_of_any_size_and_shape_stand_on_the_table(any_task):
 
 
 def test_what_is_seen_stands_where_c_mujoco_has_it(task, drawn):
-  """Cameras, robot and objects of randomised worlds."""
+  """Cameras, robot and objects of randomized worlds."""
   seen = _kinematics(task)(drawn)
   for world in range(WORLDS):
     data = _data(_model(task, drawn, world), drawn, world)

@@ -15,7 +15,7 @@ HEIGHT, WIDTH = 48, 64
 
 
 def _model(*, turn: float = 0.0) -> mujoco.MjModel:
-  """A scene whose colours, sizes, light and camera follow from one number."""
+  """A scene whose colors, sizes, light and camera follow from one number."""
   xml = f"""
 <mujoco><worldbody>
   <light directional="true" dir="{0.4 - turn} -0.2 -1"/>

@@ -69,7 +69,7 @@ def _look_at(position: np.ndarray, target: np.ndarray, roll: float) -> np.ndarra
   return quaternion
 
 
-def _randomise(model: mujoco.MjModel, data: mujoco.MjData, rng) -> None:
+def _randomize(model: mujoco.MjModel, data: mujoco.MjData, rng) -> None:
   """Geoms in a box around (0, 0, 0.45), the camera 1.1 to 1.6 m from there."""
   for k in range(model.nmocap):
     data.mocap_pos[k] = rng.uniform([-0.5, -0.5, 0.2], [0.5, 0.5, 0.7])
@@ -121,7 +121,7 @@ def world() -> World:
   camera = CameraSpec.from_model(model, "eye", height=HEIGHT, width=WIDTH)
   rng, states, poses = np.random.default_rng(0), [], []
   for _ in range(16):
-    _randomise(model, data, rng)
+    _randomize(model, data, rng)
     states.append(render_oracles.get_state(model, data))
     poses.append(_poses(data, camera))
   stacked = tuple(np.stack(p) for p in zip(*poses, strict=True))
@@ -129,7 +129,7 @@ def world() -> World:
 
 
 def _interior(ids: np.ndarray) -> np.ndarray:
-  """bool[n, H, W]: pixels whose eight neighbours show the same geom."""
+  """bool[n, H, W]: pixels whose eight neighbors show the same geom."""
   padded = np.pad(ids, ((0, 0), (1, 1), (1, 1)), "edge")
   height, width = ids.shape[1:]
   same = np.ones(ids.shape, bool)
@@ -440,7 +440,7 @@ def test_no_silent_promotion(world):
 def test_bad_arguments_are_refused(world):
   poses = world.poses
   with pytest.raises(ValueError, match="outputs must be some of"):
-    render(world.geoms, world.camera, *poses, outputs=("colour",))
+    render(world.geoms, world.camera, *poses, outputs=("color",))
   with pytest.raises(ValueError, match="poses do not fit"):
     render(world.geoms, world.camera, poses[0][:3], *poses[1:])
   floor, disc = world.model.geom("floor").id, world.model.geom("disc").id

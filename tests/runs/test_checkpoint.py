@@ -260,7 +260,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 @pytest.mark.parametrize("damage", ["flip", "cut", "remove"])
-def test_damage_is_recognised_named_and_the_one_before_taken(tmp_path: Path, damage):
+def test_damage_is_recognized_named_and_the_one_before_taken(tmp_path: Path, damage):
   """One bit or one file of the newest checkpoint at a time, in every one of its files.
 
   What comes back is either the newest or the one before, never anything else.

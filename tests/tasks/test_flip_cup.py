@@ -61,7 +61,7 @@ def solved(task, resets, half):
 
 
 def on_goal(task, state, height, shift=(0.0, 0.0, 0.0), turn=UPRIGHT):
-  """The cup's centre is ``height`` above the goal, and shifted from there."""
+  """The cup's center is ``height`` above the goal, and shifted from there."""
   goal = np.asarray(state.mocap_pos[:, task.scene.mocap("goal")])
   where = goal + np.asarray(shift)
   where[:, 2] += height

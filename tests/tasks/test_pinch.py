@@ -52,10 +52,10 @@ def hand_at(model: mujoco.MjModel, gap: float, arm=(0.3, -1.0, 1.2, -0.4, -0.9, 
 
 
 def pads(data: mujoco.MjData) -> np.ndarray:
-  """Pads' centres in the frame of the tool, f64[2, 3]: right, left."""
+  """Pads' centers in the frame of the tool, f64[2, 3]: right, left."""
   tool = data.site("tool")
-  centres = np.stack([data.geom("r_pad").xpos, data.geom("l_pad").xpos])
-  return (centres - tool.xpos) @ tool.xmat.reshape(3, 3)
+  centers = np.stack([data.geom("r_pad").xpos, data.geom("l_pad").xpos])
+  return (centers - tool.xpos) @ tool.xmat.reshape(3, 3)
 
 
 @pytest.mark.parametrize("gap", GAPS)
@@ -134,7 +134,7 @@ def hands(scene, resets, gaps, wrist=0.0) -> physics.PhysicsState:
 
 
 def test_the_point_is_where_the_pads_meet_their_object(scene, resets, pinch, forward):
-  """``above`` further along the tool than the pads' centre, at the object's width."""
+  """``above`` further along the tool than the pads' center, at the object's width."""
   wrist = np.linspace(-1, 1, 6)
   kinematics = forward(hands(scene, resets, [WIDTH] * 6, wrist))
   right, left = (

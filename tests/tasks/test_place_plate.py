@@ -31,7 +31,7 @@ OPEN = 0.1
 
 RADIUS, THICKNESS = place_plate.RADIUS, place_plate.THICKNESS
 RIM = RADIUS - place_plate.GRASP_INSET
-"""m from the plate's centre to where it is gripped."""
+"""m from the plate's center to where it is gripped."""
 
 GRASP = -float(pinch_height(THICKNESS))
 """m; height of the tool over what the pads grip."""
@@ -142,7 +142,7 @@ def test_the_plate_touches_neither_jaws_nor_walls(task, draw):
   for qpos, mocap_pos, mocap_quat, *_ in zip(*(x[:100] for x in draw), strict=True):
     data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = qpos, mocap_pos, mocap_quat
     mujoco.mj_forward(model, data)
-    # Two millimetres on both sides.
+    # Two millimeters on both sides.
     for jaw in jaws:
       assert nearest([jaw], ["plate"]) == pytest.approx(0.002, abs=1e-5)
     assert nearest(walls, ["plate", *jaws]) > 0
@@ -188,7 +188,7 @@ def test_a_plate_in_the_box_is_success(task, resets, kinematics, turn, where):
     (0.3, 0.0, False),
   ],
 )
-def test_its_centre_must_be_between_the_walls(
+def test_its_center_must_be_between_the_walls(
   task, resets, kinematics, turn, x, y, expected
 ):
   height = RADIUS if turn is STANDING else FLOOR
@@ -268,7 +268,7 @@ def test_a_plate_let_go_in_the_box_stays_in_it(
 
 
 def test_a_plate_dropped_on_a_wall_does_not_count(task, resets, kinematics, rest):
-  """It comes to rest outside, or leaning on the wall with its centre above it."""
+  """It comes to rest outside, or leaning on the wall with its center above it."""
   state = rest(in_box(task, resets, (0.20, 0.0, 0.08), lying()))
   assert not judge(task, state, kinematics).any()
 

@@ -82,7 +82,7 @@ def test_the_plate_must_lie_flat(task, solved, axis, angle, expected):
 
 
 def test_a_plate_that_lies_upside_down_is_no_success(task, solved, rest):
-  """Only its floor touches the table, so that its centre is as low as ever."""
+  """Only its floor touches the table, so that its center is as low as ever."""
   state = rest(turned(task, solved, "x", np.pi))
   np.testing.assert_allclose(pos(task, state, "plate")[:, 2], 0.003, atol=1e-3)
   assert not judge(task, state).any()

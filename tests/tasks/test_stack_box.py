@@ -29,7 +29,7 @@ OPEN = 0.1
 """m between the pads."""
 
 GRASP = 0.004 - float(pinch_height(stack_box.SIDE))
-"""m; height of the tool over the box's centre when the pads are 4 mm above it."""
+"""m; height of the tool over the box's center when the pads are 4 mm above it."""
 
 ON_BLUE = (0.0, 0.0, stack_box.SIDE)
 
@@ -175,7 +175,7 @@ def test_a_box_may_lie_on_any_face(task, solved, kinematics, body, axis, angle):
 
 @pytest.mark.parametrize("angle", [0.35, np.pi / 4])
 def test_a_yellow_box_that_is_tipped_is_no_success(task, solved, kinematics, angle):
-  """With an edge on the blue box: its centre is higher than that of a lying one."""
+  """With an edge on the blue box: its center is higher than that of a lying one."""
   height = stack_box.SIDE / 2 * (np.cos(angle) + np.sin(angle) - 1)
   state = turned(task, solved, "yellow", Rotation.from_euler("y", angle))
   state = moved(task, state, "yellow", (0.0, 0.0, height))
@@ -341,13 +341,13 @@ def test_the_fingers_close_on_faces(task, resets, kinematics, neutral, turn):
 
 
 def faces(task, state, body) -> np.ndarray:
-  """Centre of the box and 0.2 m along its axis nearest to the world's x axis."""
+  """Center of the box and 0.2 m along its axis nearest to the world's x axis."""
   mat = rotation(task, state, body).as_matrix()
   normals = np.concatenate([mat, -mat], axis=-1)  # f64[n, 3, 6]
   nearest = normals[:, 0].argmax(-1)
   normal = normals[np.arange(len(mat)), :, nearest]
-  centre = np.asarray(pos(task, state, body), np.float64)
-  return np.concatenate([centre, centre + 0.2 * normal], -1)
+  center = np.asarray(pos(task, state, body), np.float64)
+  return np.concatenate([center, center + 0.2 * normal], -1)
 
 
 @pytest.mark.parametrize(

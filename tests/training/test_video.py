@@ -11,7 +11,7 @@ from apnpql_jax.training import video
 
 
 def _frames(length: int, height: int, width: int, seed: int = 0) -> np.ndarray:
-  """Blocks of flat colour that change from frame to frame."""
+  """Blocks of flat color that change from frame to frame."""
   rng = np.random.default_rng(seed)
   blocks = rng.integers(0, 256, (length, height // 12, width // 12, 3), np.uint8)
   return blocks.repeat(12, axis=1).repeat(12, axis=2)
@@ -53,7 +53,7 @@ def test_written_video_shows_the_frames(tmp_path):
   assert path == tmp_path / "episode.mp4"
   read = iio.imread(path, plugin="FFMPEG")
   assert read.shape == (5, 48, 64, 3)
-  # Middles of the blocks: the codec halves the resolution of colour.
+  # Middles of the blocks: the codec halves the resolution of color.
   error = read[:, 6:36:12, 6:60:12].astype(int) - frames[:, 6:36:12, 6:60:12]
   assert np.abs(error).mean() < 6
   assert read[:, 40:].max() < 40

@@ -20,7 +20,7 @@ class Candidates(struct.PyTreeNode):
   outputs: Array  # f32[S, *b, n]: of the value head
   q_values: Array  # f32[S, *b]
   weights: Array  # f32[S, *b]: sum to one over S
-  base: ActionDistribution  # [*b]: the policy is base exp(tilt Q), normalised
+  base: ActionDistribution  # [*b]: the policy is base exp(tilt Q), normalized
   tilt: Array  # f32[*b]: 1 / alpha, or zero where the policy is ``base`` itself
 
   @property

@@ -29,11 +29,11 @@ def non_parametric(
   num_samples: int,
   greedy: bool = False,
 ) -> Candidates:
-  """q = b exp(Q / alpha) / Z by self-normalised importance sampling (paper Eq. 6).
+  """q = b exp(Q / alpha) / Z by self-normalized importance sampling (paper Eq. 6).
 
   Args:
     heads: the networks at the states.
-    prior: the regulariser b at the same states.
+    prior: the regularizer b at the same states.
     key: random key.
     num_samples: candidates S per state.
     greedy: all weight on the one of highest value.
@@ -99,7 +99,7 @@ def cem(
 
   Args:
     heads: the networks at the states.
-    prior: the regulariser b: the first draw is its.
+    prior: the regularizer b: the first draw is its.
     key: random key.
     num_samples: not needed; ``CEM_SAMPLES`` belong to the method.
     greedy: not needed; the method is.

@@ -24,7 +24,7 @@ class Improvement(struct.PyTreeNode):
 
   candidates: Candidates  # of q, or of pi_psi where the KL is the reverse one
   weights: Array  # f32[S, *b]: of q on the candidates; sum to one over S
-  kl: Array  # f32[*b]: from that policy to the regulariser, nats
+  kl: Array  # f32[*b]: from that policy to the regularizer, nats
   entropy: Array  # f32[*b]: of q, or of pi_psi where there is one, nats
   losses: dict[str, Array]  # f32[*b] each
 
@@ -41,7 +41,7 @@ def none(heads: Heads, prior: ActionDistribution, key: Array) -> Improvement:
 def forward_kl(heads: Heads, prior: ActionDistribution, key: Array) -> Improvement:
   """min KL(q || pi_psi), moment matching (MPO): weighted likelihood of the candidates.
 
-  The candidates are those of q, drawn from the regulariser.
+  The candidates are those of q, drawn from the regularizer.
   """
   step = none(heads, prior, key)
   q, policy = step.candidates, heads.policy()

@@ -39,7 +39,7 @@ def uniform(heads: Heads, slow: Heads) -> UniformBox:
 
 
 def no_update(*_: Any) -> Losses:
-  """For regularisers without parameters of their own."""
+  """For regularizers without parameters of their own."""
   return {}
 
 
@@ -64,7 +64,7 @@ def fit_advantageous(
   key: Array,
   nu: Array,
 ) -> Losses:
-  """The advantage-weighted behaviour model (ABM, Siegel 2020): max 1[A >= 0] log b(a).
+  """The advantage-weighted behavior model (ABM, Siegel 2020): max 1[A >= 0] log b(a).
 
   a is the replayed action, A = Q(s, a) - E_pi[Q(s, .)].
   """
