@@ -1,7 +1,7 @@
 """AP-NPQL on JAX and MuJoCo: pixels to policy with one command.
 
-The names below are the public API. Each is imported on first use, so that importing the
-package is instant. A program that uses it calls ``configure`` first.
+The names below are the public API, imported on first use so that importing the package
+is fast. Programs call ``configure`` first.
 """
 
 from __future__ import annotations
@@ -25,7 +25,11 @@ if TYPE_CHECKING:
     TrainConfig as TrainConfig,
   )
   from apnpql_jax.envs.env import Env as Env, make_env as make_env
-  from apnpql_jax.errors import ConfigError as ConfigError, UserError as UserError
+  from apnpql_jax.errors import (
+    ConfigError as ConfigError,
+    RunStopped as RunStopped,
+    UserError as UserError,
+  )
   from apnpql_jax.runtime import configure as configure
   from apnpql_jax.tasks.task import (
     Task as Task,
@@ -42,10 +46,10 @@ _MODULES = {
   "config.ranges": ("RandomizationConfig",),
   "config.schema": ("AgentConfig", "EnvConfig", "ReplayConfig", "TrainConfig"),
   "envs.env": ("Env", "make_env"),
-  "errors": ("ConfigError", "UserError"),
-  "training.evaluate": ("evaluate",),
+  "errors": ("ConfigError", "RunStopped", "UserError"),
   "runtime": ("configure",),
   "tasks.task": ("Task", "make_task", "register_task", "task_names"),
+  "training.evaluate": ("evaluate",),
   "training.train": ("train",),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}

@@ -1,4 +1,4 @@
-"""``python -m apnpql_jax`` is the command ``apnpql``."""
+"""The command ``apnpql`` as ``python -m apnpql_jax``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lines for the user on standard error."""
+"""Messages to the user on standard error."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ import sys
 
 
 def say(line: str) -> None:
-  """Prints a line; a standard error that cannot be written to is ignored."""
+  """Prints a line to standard error; ignores failures to write."""
   with contextlib.suppress(OSError):
     print(line, file=sys.stderr, flush=True)

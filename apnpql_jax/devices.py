@@ -1,9 +1,9 @@
-"""Several devices: worlds and batches are split between them, all else is on each.
+"""Several devices and processes: worlds and batches are split, all else is replicated.
 
-The iteration stays one program for all worlds, which XLA splits where its arrays are
-split: random numbers are those of one device, and results are too, within rounding.
-Where the parts of the state lie is said in ``iteration``. Processes on several hosts
-share one run: each computes for its own devices, and the first one tells of it.
+The iteration stays one program for all worlds, which XLA partitions along its arrays:
+random numbers equal those of one device, and results do within rounding. Module
+``placement`` says which part of the state is split. Processes on several hosts share
+one run: each computes for its own devices, and the first one writes and prints.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ import numpy as np
 from apnpql_jax.errors import ConfigError, one_line
 
 AXIS = "worlds"
-"""The one axis of the mesh; batches are split along it too."""
+"""The only axis of the mesh; batches are split along it too."""
 
 _MEMINFO = Path("/proc/meminfo")
 _CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
-_PATIENCE_MS = 3_600_000
-_meetings = itertools.count()
+_BARRIER_TIMEOUT_MS = 3_600_000
+_barriers = itertools.count()
 
 
 def join(coordinator: str, processes: int | None, process: int | None) -> None:
-  """Makes this process one of those of a run; before anything starts JAX's backend.
+  """Joins the processes of a run; must precede the start of JAX's backend.
 
   Args:
-    coordinator: address and port of the first process; "auto" if the batch system
-      knows it and the rest.
-    processes: how many share the run.
-    process: which of them this is, from 0.
+    coordinator: Address and port of the first process; "auto" to get all three values
+      from the batch system.
+    processes: Number of processes that share the run.
+    process: Index of this process, from 0.
 
   Raises:
-    ConfigError: they do not find each other.
+    ConfigError: The processes cannot connect.
   """
-  # Signals are our own business: JAX would take SIGTERM for itself.
+  # The run handles signals itself; JAX would take over SIGTERM.
   jax.config.update("jax_enable_preemption_service", False)
   address = None if coordinator == "auto" else coordinator
   try:
@@ -52,13 +52,13 @@ def join(coordinator: str, processes: int | None, process: int | None) -> None:
 
 
 def make_mesh(devices: int) -> Mesh | None:
-  """The devices of a run in a row, or None if it is one.
+  """Returns a one-dimensional mesh of the first devices, or None for a single one.
 
   Args:
-    devices: how many; 0 for all those of all processes.
+    devices: Number of devices; 0 for all devices of all processes.
 
   Raises:
-    ConfigError: there are not as many.
+    ConfigError: There are fewer devices.
   """
   found = jax.devices()
   if not 0 <= devices <= len(found):
@@ -68,15 +68,14 @@ def make_mesh(devices: int) -> Mesh | None:
 
 
 def per_device(function: Callable[..., Any], mesh: Mesh | None) -> Callable[..., Any]:
-  """A function of arrays [worlds, ...] that each device applies to its own worlds.
+  """Returns a function of arrays [worlds, ...] that each device runs on its own worlds.
 
-  For what every world does by itself. XLA would split it too, but not calls of the
-  host, and a loop would run on all devices until the last world of all is done, with
-  a message between them each time.
+  For computations without interaction between worlds. XLA can partition these too, but
+  not host calls, and a loop would run on all devices until the last world is done, with
+  a message between devices in every iteration.
   """
   if mesh is None:
     return function
-
   spec = PartitionSpec(AXIS)
   return jax.shard_map(
     function, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
@@ -84,52 +83,52 @@ def per_device(function: Callable[..., Any], mesh: Mesh | None) -> Callable[...,
 
 
 def local(tree: Any) -> Any:
-  """What is on each device as arrays of this process's first one alone."""
+  """Returns replicated arrays as arrays on the first device of this process."""
   return jax.tree.map(lambda x: x.addressable_data(0), tree)
 
 
-def leads() -> bool:
-  """Whether this is the process that writes and tells, the first or the only one."""
+def is_primary() -> bool:
+  """Returns whether this is the first process, which writes and prints."""
   return jax.process_index() == 0
 
 
-def first_alone(function: Callable[[], Any]) -> None:
-  """Calls it in the first process; the others go on when it is done."""
-  if leads():
+def run_on_primary(function: Callable[[], Any]) -> None:
+  """Calls a function in the first process; the others wait until it returns."""
+  if is_primary():
     function()
-  meet()
+  barrier()
 
 
-def anywhere(flag: object) -> bool:
-  """Whether it is true in any process, the same answer in all of them."""
-  meet()
+def any_process(flag: object) -> bool:
+  """Returns in every process whether the flag is true in any of them."""
+  barrier()
   return bool(multihost_utils.process_allgather(np.array(bool(flag))).any())
 
 
-def meet() -> None:
-  """Returns when all processes have come here, however long that takes.
+def barrier() -> None:
+  """Waits until all processes have called this.
 
-  Within a program, CPUs wait for each other no longer than 30 seconds: what takes one
-  process longer than another must be followed by this.
+  Inside a compiled program CPUs wait at most 30 seconds for each other, so whatever
+  takes processes different times must be followed by a barrier.
   """
   if jax.process_count() == 1:
     return
   from orbax.checkpoint import multihost
 
   wait = multihost.get_barrier_sync_fn()
-  wait(key=f"apnpql_{next(_meetings)}", timeout_ms=_PATIENCE_MS)
+  wait(key=f"apnpql_{next(_barriers)}", timeout_ms=_BARRIER_TIMEOUT_MS)
 
 
 def check_memory(needed: int, what: str, available: int | None = None) -> None:
-  """Refuses what does not fit, before it is allocated.
+  """Checks that something fits into memory before it is allocated.
 
   Args:
-    needed: bytes about to be taken.
-    what: name of the thing in the message.
-    available: bytes free; asked of the machine if None.
+    needed: Size in bytes.
+    what: Name of the thing in the message.
+    available: Free bytes; those of the device if None.
 
   Raises:
-    ConfigError: ``needed`` is more than is free.
+    ConfigError: ``needed`` exceeds the free memory.
   """
   free = available_memory() if available is None else available
   if free is not None and needed > free:
@@ -140,7 +139,7 @@ def check_memory(needed: int, what: str, available: int | None = None) -> None:
 
 
 def available_memory() -> int | None:
-  """Bytes free on each device: its memory, else its share of RAM; None if unknown."""
+  """Returns the free bytes per device, a share of RAM for CPUs; None if unknown."""
   stats = jax.local_devices()[0].memory_stats() or {}
   if "bytes_limit" in stats:
     return stats["bytes_limit"] - stats.get("bytes_in_use", 0)
@@ -149,7 +148,7 @@ def available_memory() -> int | None:
 
 
 def host_memory() -> int | None:
-  """Bytes of RAM that are free and allowed to this process; None if unknown."""
+  """Returns the bytes of RAM that this process may still use; None if unknown."""
   bounds = [b for b in (_free_memory(), _container_limit()) if b is not None]
   return min(bounds, default=None)
 
@@ -160,7 +159,7 @@ def _free_memory() -> int | None:
     return int(lines["MemAvailable"].split()[0]) * 1024
   except (OSError, KeyError, ValueError):
     pass
-  try:  # Not Linux: the memory there is, free or not.
+  try:  # Outside Linux: total memory, free or not.
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
   except (AttributeError, OSError, ValueError):
     return None
@@ -169,5 +168,5 @@ def _free_memory() -> int | None:
 def _container_limit() -> int | None:
   try:
     return int(_CGROUP_LIMIT.read_text())
-  except (OSError, ValueError):  # No such limit, or the word "max".
+  except (OSError, ValueError):  # No limit, or "max".
     return None

@@ -1,33 +1,33 @@
-"""Errors with a one-line message for the user, and the exit codes of runs."""
+"""Errors with one-line messages for the user, and exit codes of runs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 INTERRUPTED = 128
-"""Exit code of a run stopped by a signal, plus the number of the signal."""
+"""Exit code of a run stopped by a signal, to which the signal number is added."""
 
 FAILED = 3
-"""Exit code of a run that stopped by itself: disk full, or values not finite."""
+"""Exit code of a run that stopped on an error: disk full or values not finite."""
 
 
 class UserError(Exception):
-  """A request that cannot be served; the one-line message names the cure."""
+  """A request that cannot be met; the one-line message names the fix."""
 
 
 class ConfigError(UserError, ValueError):
-  """A setting that cannot work; the message says what to write instead."""
+  """An invalid setting; the message says what to write instead."""
 
 
 class FileError(UserError):
-  """A file or folder that cannot be used: damaged, foreign, locked or out of reach."""
+  """A file or folder that is damaged, foreign, locked or inaccessible."""
 
 
 class RunStopped(Exception):
-  """A run that ended before its last step, in order; the one-line message says why."""
+  """An orderly stop of a run before its last step; the one-line message says why."""
 
   def __init__(self, message: str, code: int):
-    """Keeps the exit code, ``INTERRUPTED`` plus a signal or ``FAILED``."""
+    """Stores the exit code: ``FAILED``, or ``INTERRUPTED`` plus a signal number."""
     super().__init__(message)
     self.code = code
 
@@ -41,7 +41,7 @@ def check_name(field: str, value: str, valid: Sequence[str]) -> None:
   """Checks that ``value`` is one of the valid choices.
 
   Raises:
-    ConfigError: it is not; the message lists the choices.
+    ConfigError: It is not; the message lists the choices.
   """
   if value not in valid:
     raise ConfigError(f"unknown {field} {value!r}; choose from {', '.join(valid)}")

@@ -41,7 +41,7 @@ from apnpql_jax.training.state import initial_state
 from apnpql_jax.types import Array, Transition
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
-from batches import random_batch  # noqa: E402  (the noise that the tests use)
+from apnpql_jax.testing import random_batch
 
 PRECISIONS = ("highest", "tensorfloat32")
 

@@ -48,7 +48,7 @@ from apnpql_jax.training.expert import example_slot
 from apnpql_jax.types import Observation
 
 sys.path.append(str(tables.ROOT / "tests"))
-from batches import random_batch  # noqa: E402  (the noise that the tests use)
+from apnpql_jax.testing import random_batch
 
 BATCH = 64
 WORLDS = 32

@@ -32,7 +32,7 @@ from apnpql_jax.training.rollout import rollout
 from apnpql_jax.types import Array, Transition
 
 sys.path.append(str(tables.ROOT / "tests"))
-from batches import random_batch  # noqa: E402  (the noise that the tests use)
+from apnpql_jax.testing import random_batch
 
 
 def worlds(settings: dict[str, Any]) -> dict[str, sides.Measure]:

@@ -1,33 +1,23 @@
-"""What each command of ``apnpql`` does with its options; returns what is to be shown.
+"""Commands of ``apnpql``: each takes its options and returns its result.
 
-JAX, MuJoCo and everything built on them are imported inside the functions, so that
-help and refusals of bad input are instant.
+JAX, MuJoCo and the modules that need them are imported inside the functions, so that
+help and errors are fast.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 import dataclasses
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apnpql_jax.cli.options import (
-  Collect,
-  Convert,
-  Evaluate,
-  List,
-  Repeat,
-  Train,
-  parse,
-)
+from apnpql_jax.cli.options import Collect, Convert, Evaluate, List, Repeat, Train
 from apnpql_jax.config import files
 from apnpql_jax.config.checks import BACKENDS, validate
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.console import say
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs import run_folder
-from apnpql_jax.training import expert
 
 if TYPE_CHECKING:
   from jax.sharding import Mesh
@@ -35,19 +25,25 @@ if TYPE_CHECKING:
 Json = dict[str, Any]
 
 
-def train(args: Train, argv: Sequence[str]) -> Json:
-  """Validates everything, then trains or goes on training; returns its summary."""
+def base_config(args: Train) -> TrainConfig:
+  """Returns the settings that ``train`` starts from: those of the preset or the run.
+
+  Raises:
+    ConfigError: The options contradict each other or name no preset.
+    FileError: The run cannot be read.
+  """
   if args.resume is not None and (args.run is not None or args.overwrite):
     raise ConfigError("--resume names the run itself; leave out --run and --overwrite")
-  if not args.preset and args.resume is None:
+  if args.preset:
+    return files.load_preset(args.preset)
+  if args.resume is None:
     names = ", ".join(files.preset_names())
     raise ConfigError(f"train needs a preset; choose from {names}")
-  if args.preset:
-    base = files.load_preset(args.preset)
-  else:
-    base = run_folder.load_run_config(args.resume or Path(), say)
-  # Parsed a second time, now on top of the settings asked for.
-  args = parse(Train, "train", argv, default=Train(config=base))
+  return run_folder.load_run_config(args.resume, say)
+
+
+def train(args: Train) -> Json:
+  """Checks all options, then trains or resumes a run and returns its summary."""
   config = _with_shortcuts(args)
   run_dir = args.resume or args.run or run_folder.new_run_dir(args.preset)
   if args.resume is None:
@@ -56,11 +52,18 @@ def train(args: Train, argv: Sequence[str]) -> Json:
   if args.resume is not None:
     run_folder.check_resumable(args.resume, config)
   mesh = _mesh(args)
-  _check_registered(config, num_devices=mesh.size if mesh else 1)
 
-  from apnpql_jax import devices
+  from apnpql_jax import devices, tasks
+  from apnpql_jax.agents import table_one
   from apnpql_jax.training.train import train as run_training
 
+  validate(
+    config,
+    tasks=tasks.task_names(),
+    algorithms=table_one.epsilon_bounds(),
+    memory_bytes=devices.available_memory(),
+    devices=mesh.size if mesh else 1,
+  )
   summary = run_training(
     config,
     run_dir,
@@ -68,12 +71,11 @@ def train(args: Train, argv: Sequence[str]) -> Json:
     overwrite=args.overwrite,
     mesh=mesh,
   )
-  return summary if devices.leads() else {}
+  return summary if devices.is_primary() else {}
 
 
-def evaluate(args: Evaluate, argv: Sequence[str]) -> Json:
+def evaluate(args: Evaluate) -> Json:
   """Plays held-out episodes with a checkpoint of a run."""
-  del argv
   if not args.run:
     raise ConfigError("evaluate needs a run folder: apnpql evaluate RUN")
   _check_episodes(args.episodes, args.seed)
@@ -95,58 +97,44 @@ def evaluate(args: Evaluate, argv: Sequence[str]) -> Json:
   )
 
 
-def collect(args: Collect, argv: Sequence[str]) -> Json:
+def collect(args: Collect) -> Json:
   """Plays episodes with the scripted expert of a task."""
-  del argv
   _check_episodes(args.episodes, args.seed)
   _check_video(args.video)
   check_name("backend", args.backend, BACKENDS)
   if not 0.0 <= args.noise < float("inf"):
-    raise ConfigError(f"--noise {args.noise} must be a number of at least 0, in rad/s")
+    raise ConfigError(f"--noise {args.noise} must be a finite number of at least 0")
+  # The expert acts on privileged poses, so images are not needed.
+  env = dataclasses.replace(_task_env(args.task), backend=args.backend, obs="state")
 
-  from apnpql_jax import tasks
-
-  check_name("task", args.task, tasks.task_names())
-  env = EnvConfig(task=args.task)
-  if args.task in files.preset_names():
-    env = files.load_preset(args.task).env
-
+  from apnpql_jax.training import expert
   from apnpql_jax.training.evaluate import evaluate_expert
 
-  # The expert acts on privileged poses: drawing images would only cost time.
-  env = dataclasses.replace(env, task=args.task, backend=args.backend, obs="state")
   settings = {"episodes": args.episodes, "seed": args.seed, "noise": args.noise}
   figures = evaluate_expert(env, video=args.video, **settings)
-  if args.save is None:
-    return figures
+  if args.save is not None:
+    figures |= expert.save_expert(args.save, env, **settings)
+  return figures
 
-  return figures | expert.save_expert(args.save, env, **settings)
 
-
-def convert(args: Convert, argv: Sequence[str]) -> Json:
-  """Makes demonstrations of recorded joint trajectories."""
-  del argv
+def convert(args: Convert) -> Json:
+  """Converts recorded joint trajectories into demonstrations."""
   if not args.out:
-    raise ConfigError(
-      "convert needs three names: apnpql convert RECORDING.npz TASK OUT.npz"
-    )
+    raise ConfigError("usage: apnpql convert REC.npz TASK OUT.npz")
+  env = _task_env(args.task)
+
   from apnpql_jax import tasks
   from apnpql_jax.data import demonstrations, real_arm
 
-  check_name("task", args.task, tasks.task_names())
-  period_s = EnvConfig().control_period_s
-  if args.task in files.preset_names():
-    period_s = files.load_preset(args.task).env.control_period_s
-  scene = tasks.make_task(args.task).scene
+  scene, period_s = tasks.make_task(args.task).scene, env.control_period_s
   demos = real_arm.convert(Path(args.recording), scene, period_s=period_s)
   return demonstrations.save(
     Path(args.out), demos, task=args.task, control_period_s=period_s
   )
 
 
-def repeat(args: Repeat, argv: Sequence[str]) -> Json:
-  """Names what was not finite in an update that a run stopped for."""
-  del argv
+def repeat(args: Repeat) -> Json:
+  """Repeats the update that stopped a run and names what was not finite."""
   if not args.file:
     raise ConfigError("repeat needs a file: apnpql repeat RUN/faults/step_<n>.npz")
   path = Path(args.file).absolute()
@@ -157,9 +145,8 @@ def repeat(args: Repeat, argv: Sequence[str]) -> Json:
   return faults.repeat(path)
 
 
-def list_names(args: List, argv: Sequence[str]) -> Json:
-  """The names that other commands accept, or what the contacts of each task cost."""
-  del argv
+def list_names(args: List) -> Json:
+  """Returns the names that other commands accept, or a contact report of each task."""
   from apnpql_jax import tasks
   from apnpql_jax.agents import table_one
 
@@ -176,11 +163,22 @@ def list_names(args: List, argv: Sequence[str]) -> Json:
   }
 
 
-def _mesh(args: Train) -> Mesh | None:
-  """The devices to train on; waits for the other processes, if there are any.
+def _with_shortcuts(args: Train) -> TrainConfig:
+  """Returns the settings with --backend, --obs and --algorithm applied."""
+  config = args.config
+  env = {"backend": args.backend, "obs": args.obs}
+  env = {name: value for name, value in env.items() if value is not None}
+  config = dataclasses.replace(config, env=dataclasses.replace(config.env, **env))
+  if args.algorithm is None:
+    return config
+  agent = dataclasses.replace(config.agent, algorithm=args.algorithm)
+  return dataclasses.replace(config, agent=agent)
 
-  Nothing is written until all have come here, so that all have seen the same run
-  folder before.
+
+def _mesh(args: Train) -> Mesh | None:
+  """Returns the devices to train on; waits for the other processes, if any.
+
+  Called before anything is written, so that all processes find the same run folder.
   """
   if args.coordinator and args.run is None and args.resume is None:
     raise ConfigError("processes of one run must be given the same --run")
@@ -188,29 +186,24 @@ def _mesh(args: Train) -> Mesh | None:
     raise ConfigError("--processes and --process need a --coordinator")
   from apnpql_jax import devices
 
-  count = args.devices
-  if args.coordinator:
-    devices.join(args.coordinator, args.processes, args.process)
-    count = 0
-  return devices.make_mesh(count)
+  if not args.coordinator:
+    return devices.make_mesh(args.devices)
+  devices.join(args.coordinator, args.processes, args.process)
+  return devices.make_mesh(0)
 
 
-def _check_registered(config: TrainConfig, *, num_devices: int) -> None:
-  """Checks what needs the simulator, the learner or the device to be known."""
-  from apnpql_jax import devices, tasks
-  from apnpql_jax.agents import table_one
+def _task_env(task: str) -> EnvConfig:
+  """Returns the environment of a task's preset, or the default one for the task."""
+  from apnpql_jax import tasks
 
-  validate(
-    config,
-    tasks=tasks.task_names(),
-    algorithms=table_one.epsilon_bounds(),
-    memory_bytes=devices.available_memory(),
-    devices=num_devices,
-  )
+  check_name("task", task, tasks.task_names())
+  preset = task in files.preset_names()
+  env = files.load_preset(task).env if preset else EnvConfig()
+  return dataclasses.replace(env, task=task)
 
 
 def _checkpoint_step(args: Evaluate) -> int | None:
-  """Steps of the checkpoint asked for; None for the newest."""
+  """Returns the step of the checkpoint asked for; None for the newest."""
   if args.checkpoint == "newest":
     return None
   if args.checkpoint == "best":
@@ -220,7 +213,7 @@ def _checkpoint_step(args: Evaluate) -> int | None:
   if args.checkpoint.isdigit():
     return int(args.checkpoint)
   raise ConfigError(
-    f"unknown --checkpoint {args.checkpoint!r}; choose from newest, best, or its steps"
+    f"unknown --checkpoint {args.checkpoint!r}; choose from newest, best, or a step"
   )
 
 
@@ -243,14 +236,3 @@ def _check_video(path: Path | None) -> None:
     raise ConfigError(f"--video {path}: {error}") from None
   if not fit:
     raise ConfigError(f"--video {path} cannot be written")
-
-
-def _with_shortcuts(args: Train) -> TrainConfig:
-  config = args.config
-  env = {"backend": args.backend, "obs": args.obs}
-  env = {name: value for name, value in env.items() if value is not None}
-  config = dataclasses.replace(config, env=dataclasses.replace(config.env, **env))
-  if args.algorithm is None:
-    return config
-  agent = dataclasses.replace(config.agent, algorithm=args.algorithm)
-  return dataclasses.replace(config, agent=agent)

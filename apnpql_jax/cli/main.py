@@ -1,4 +1,4 @@
-"""The command ``apnpql``: parses, calls, and shows results and errors, no more."""
+"""Entry point of ``apnpql``: parses options, runs the command, shows its result."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from apnpql_jax.version import __version__
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-  """Runs one command line; returns the exit code.
+  """Runs one command line and returns its exit code.
 
-  0 success; 2 bad input; 3 a run that had to stop (disk full, values not finite); 130
-  Ctrl-C and 143 SIGTERM, with a run saved. All but 0 with one line on standard error.
+  0 is success, 2 bad input, 3 a run that had to stop (disk full, values not finite),
+  130 Ctrl-C and 143 SIGTERM, with the run saved. All but 0 print one line to stderr.
   """
   runtime.configure()
   args = list(sys.argv[1:] if argv is None else argv)
@@ -48,12 +48,12 @@ def main(argv: Sequence[str] | None = None) -> int:
       print(__version__)
       return 0
     check_name("command", args[0], list(_COMMANDS))
-    kind, command, show = _COMMANDS[args[0]]
-    parsed = parse(kind, args[0], args[1:], default=_preset_named(kind, args))
-    with Signals("interrupted"), _only_json(parsed.json) as write:
-      result = command(parsed, args[1:])
-      if result:  # Of several processes, the first one tells.
-        write(_to_json(result) if parsed.json else show(result))
+    kind, command = _COMMANDS[args[0]]
+    options = _parse(kind, args)
+    with Signals("interrupted"), _json_only(options.json) as write:
+      result = command(options)
+      if result:  # Empty in all but the first of several processes.
+        write(_to_json(result) if options.json else _show(result))
     return 0
   except UserError as error:
     say(f"apnpql: {' '.join(str(error).split())}")
@@ -61,29 +61,33 @@ def main(argv: Sequence[str] | None = None) -> int:
   except errors.RunStopped as stop:
     say(f"apnpql: {stop}")
     if stop.code == errors.FAILED:
-      # Threads of a save that failed half-way may wait for each other for minutes.
+      # Threads of a failed save may wait for each other for minutes.
       os._exit(stop.code)
     return stop.code
   except KeyboardInterrupt:
     return errors.INTERRUPTED + signal.SIGINT
-  except BrokenPipeError:  # The reader of our output left, as `head` does.
+  except BrokenPipeError:  # The reader of our output has exited, as `head` does.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     return 0
 
 
-def _preset_named(kind: type[Any], args: Sequence[str]) -> Train | None:
-  """The defaults that ``train PRESET --help`` has to show."""
-  named = [arg for arg in args if arg in files.preset_names()]
-  if kind is not Train or not named:
-    return None
-  return Train(config=files.load_preset(named[0]))
+def _parse(kind: type[Any], args: Sequence[str]) -> Any:
+  """Returns the options of a command; those of ``train`` override its preset or run."""
+  name, *rest = args
+  if kind is not Train:
+    return parse(kind, name, rest)
+  # Parsing ends here for --help, which shows the settings of a preset named before it.
+  presets = [arg for arg in rest if arg in files.preset_names()]
+  default = Train(config=files.load_preset(presets[0])) if presets else None
+  base = commands.base_config(parse(Train, name, rest, default=default))
+  return parse(Train, name, rest, default=Train(config=base))
 
 
 @contextlib.contextmanager
-def _only_json(enabled: bool) -> Generator[Callable[[str], Any], None, None]:
-  """Yields how to write the result; with JSON, all other output goes to stderr.
+def _json_only(enabled: bool) -> Generator[Callable[[str], Any], None, None]:
+  """Yields a function that prints the result; with JSON, all else goes to stderr.
 
-  The file descriptor itself is redirected, because libraries below Python print too.
+  Redirects the file descriptor, because libraries print below Python too.
   """
   if not enabled:
     yield print
@@ -104,8 +108,8 @@ def _to_json(result: Json) -> str:
 
 
 def _plain(value: Any) -> Any:
-  """``value`` as JSON can hold it: arrays as lists, paths as text, NaN as null."""
-  if hasattr(value, "tolist"):  # numpy, JAX
+  """Returns ``value`` for JSON: arrays as lists, paths as text, NaN as null."""
+  if hasattr(value, "tolist"):  # NumPy and JAX arrays.
     value = value.tolist()
   if isinstance(value, dict):
     return {str(key): _plain(item) for key, item in value.items()}
@@ -116,36 +120,35 @@ def _plain(value: Any) -> Any:
   return value if isinstance(value, str | int | float | None) else str(value)
 
 
-def _show_figures(result: Json) -> str:
-  width = max(map(len, result), default=0)
-  return "\n".join(f"{name:<{width}}  {value}" for name, value in result.items())
-
-
-def _show_names(result: Json) -> str:
+def _show(result: Json) -> str:
+  """Returns the result as one line per entry, for people."""
   width = max(map(len, result))
-  lines = []
-  for kind, names in result.items():
-    if isinstance(names, dict):  # A contact report.
-      names = [
-        f"{value:,.0f} {name.replace('_', ' ')}" for name, value in names.items()
-      ]
-    lines.append(f"{kind:<{width}}  {', '.join(names)}")
-  return "\n".join(lines)
+  return "\n".join(f"{name:<{width}}  {_text(x)}" for name, x in result.items())
+
+
+def _text(value: Any) -> str:
+  if isinstance(value, dict):  # A contact report.
+    value = [
+      f"{number:,.0f} {name.replace('_', ' ')}" for name, number in value.items()
+    ]
+  if isinstance(value, list):
+    return ", ".join(value) or "none"
+  return str(value)
 
 
 def _help() -> str:
   lines = ["usage: apnpql COMMAND [options]", ""]
-  for name, (kind, _, _) in _COMMANDS.items():
+  for name, (kind, _) in _COMMANDS.items():
     lines.append(f"  {name:<9} {(kind.__doc__ or '').splitlines()[0]}")
   lines += ["", "apnpql COMMAND --help shows its options."]
   return "\n".join(lines)
 
 
-_COMMANDS: dict[str, tuple[type[Any], Callable[[Any, Sequence[str]], Json], Any]] = {
-  "train": (Train, commands.train, _show_figures),
-  "evaluate": (Evaluate, commands.evaluate, _show_figures),
-  "collect": (Collect, commands.collect, _show_figures),
-  "convert": (Convert, commands.convert, _show_figures),
-  "repeat": (Repeat, commands.repeat, _show_figures),
-  "list": (List, commands.list_names, _show_names),
+_COMMANDS: dict[str, tuple[type[Any], Callable[[Any], Json]]] = {
+  "train": (Train, commands.train),
+  "evaluate": (Evaluate, commands.evaluate),
+  "collect": (Collect, commands.collect),
+  "convert": (Convert, commands.convert),
+  "repeat": (Repeat, commands.repeat),
+  "list": (List, commands.list_names),
 }

@@ -1,4 +1,4 @@
-"""Options of the command line, and their parsing with one-line errors."""
+"""Command-line options, and their parsing with one-line errors."""
 
 from __future__ import annotations
 
@@ -15,8 +15,26 @@ from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import ConfigError
 
 T = TypeVar("T")
+
+
+def _default_hint(text: str) -> object:
+  return tyro.conf.arg(help_behavior_hint=text)
+
+
 _Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
-_PRESET_HINT = tyro.conf.arg(help_behavior_hint="(default: as the preset says)")
+_Json = Annotated[
+  _Flag, tyro.conf.arg(help="Print only one JSON object on standard output.")
+]
+_OfPreset = Annotated[str | None, _default_hint("(default: as in the preset)")]
+_Count = Annotated[int | None, _default_hint("")]
+_File = Annotated[Path | None, _default_hint("")]
+_Video = Annotated[
+  Path | None,
+  tyro.conf.arg(
+    help="Also write a video of the first four episodes to this .mp4 or .gif file.",
+    help_behavior_hint="",
+  ),
+]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,45 +45,42 @@ class Train:
   """
 
   preset: tyro.conf.Positional[str] = ""
-  """Settings to start from; `apnpql list` names them."""
+  """Preset to start from; `apnpql list` shows all."""
 
   run: Annotated[
-    Path | None,
-    tyro.conf.arg(help_behavior_hint="(default: first free runs/PRESET-<n>)"),
+    Path | None, _default_hint("(default: first free runs/PRESET-<n>)")
   ] = None
-  """Folder for everything the run writes."""
+  """Run folder to create."""
 
-  resume: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="")] = None
-  """Run folder to go on with, from its newest checkpoint."""
+  resume: _File = None
+  """Run folder to resume from its latest checkpoint."""
 
   overwrite: _Flag = False
-  """Replace the run that --run holds."""
+  """Replace the existing run in --run."""
 
-  backend: Annotated[str | None, _PRESET_HINT] = None
+  backend: _OfPreset = None
   """Short for --env.backend: auto, mjx or native."""
 
-  obs: Annotated[str | None, _PRESET_HINT] = None
+  obs: _OfPreset = None
   """Short for --env.obs: pixels or state."""
 
-  algorithm: Annotated[str | None, _PRESET_HINT] = None
-  """Short for --agent.algorithm; `apnpql list` names them."""
+  algorithm: _OfPreset = None
+  """Short for --agent.algorithm; `apnpql list` shows all."""
 
   devices: int = 1
-  """Devices between which worlds and batches are split; 0: all, as several processes
-  always do."""
+  """Devices that share the worlds and batches; 0: all (always with --coordinator)."""
 
   coordinator: str = ""
-  """Address and port of the first process, where several share the run: see
-  docs/scaling.md; auto: ask the batch system, which then knows the rest too."""
+  """Address and port of the first of several processes, or auto to take it and the next
+  two options from the batch system; see docs/scaling.md."""
 
-  processes: Annotated[int | None, tyro.conf.arg(help_behavior_hint="")] = None
-  """How many processes share the run."""
+  processes: _Count = None
+  """Number of processes that share the run."""
 
-  process: Annotated[int | None, tyro.conf.arg(help_behavior_hint="")] = None
-  """Which of them this is, from 0."""
+  process: _Count = None
+  """Index of this process, from 0."""
 
-  json: _Flag = False
-  """Print one JSON object on standard output and nothing else there."""
+  json: _Json = False
 
   config: Annotated[TrainConfig, tyro.conf.arg(name="")] = dataclasses.field(
     default_factory=TrainConfig
@@ -80,29 +95,23 @@ class Evaluate:
   """Run folder."""
 
   checkpoint: str = "newest"
-  """Which one to play: newest, best (of highest success rate while training), or its
-  number of steps."""
+  """Checkpoint: newest, best (highest success rate in training) or its step."""
 
   episodes: int = 200
-  """Episodes to play."""
+  """Number of episodes."""
 
   seed: int = 0
-  """Seed of the episodes and of the policy."""
+  """Random seed of the episodes and the policy."""
 
   greedy: _Flag = False
-  """Instead of drawing an action as in training take the candidate of highest value,
-  or, of a parametric policy, the mean."""
+  """Take the best candidate, or a parametric policy's mean, instead of sampling."""
 
-  backend: Annotated[
-    str | None, tyro.conf.arg(help_behavior_hint="(default: as in training)")
-  ] = None
+  backend: Annotated[str | None, _default_hint("(default: as in training)")] = None
   """Physics engine: auto, mjx or native."""
 
-  video: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="")] = None
-  """Also write a video of the first four episodes to this .mp4 or .gif."""
+  video: _Video = None
 
-  json: _Flag = False
-  """Print one JSON object on standard output and nothing else there."""
+  json: _Json = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,47 +119,42 @@ class Collect:
   """Plays episodes with the scripted expert: apnpql collect TASK [options]."""
 
   task: tyro.conf.Positional[str] = ""
-  """Task to play; `apnpql list` names them."""
+  """Task to play; `apnpql list` shows all."""
 
   episodes: int = 200
-  """Episodes to play."""
+  """Number of episodes."""
 
   seed: int = 0
-  """Seed of the episodes and of the noise."""
+  """Random seed of the episodes and the noise."""
 
   backend: str = "auto"
   """Physics engine: auto, mjx or native."""
 
   noise: float = 0.0
-  """Standard deviation of the noise on the expert's joint velocities, rad/s."""
+  """Standard deviation of the noise on the expert's joint velocities (rad/s)."""
 
-  save: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="")] = None
-  """Also write that many episodes, from reset states of training, to this file of
-  demonstrations."""
+  save: _File = None
+  """Also save as many episodes from training resets as a file of demonstrations."""
 
-  video: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="")] = None
-  """Also write a video of the first four episodes to this .mp4 or .gif."""
+  video: _Video = None
 
-  json: _Flag = False
-  """Print one JSON object on standard output and nothing else there."""
+  json: _Json = False
 
 
 @dataclasses.dataclass(frozen=True)
 class Convert:
-  """Makes demonstrations of a recording: apnpql convert RECORDING.npz TASK OUT.npz."""
+  """Converts a recording to demonstrations: apnpql convert REC.npz TASK OUT.npz."""
 
   recording: tyro.conf.Positional[str] = ""
-  """Joint trajectories with the poses of the objects; docs/demonstrations.md has the
-  format."""
+  """Joint trajectories and object poses; see docs/demonstrations.md for the format."""
 
   task: tyro.conf.Positional[str] = ""
-  """Task they show; `apnpql list` names them."""
+  """Task of the recording; `apnpql list` shows all."""
 
   out: tyro.conf.Positional[str] = ""
   """File to write, for --replay.demonstrations."""
 
-  json: _Flag = False
-  """Print one JSON object on standard output and nothing else there."""
+  json: _Json = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,37 +162,34 @@ class Repeat:
   """Repeats an update that was not finite: apnpql repeat RUN/faults/step_<n>.npz."""
 
   file: tyro.conf.Positional[str] = ""
-  """What a run wrote when it stopped for such updates; it must lie where it was."""
+  """File that a run wrote when it stopped, still in its run folder."""
 
-  json: _Flag = False
-  """Print one JSON object on standard output and nothing else there."""
+  json: _Json = False
 
 
 @dataclasses.dataclass(frozen=True)
 class List:
-  """Names the tasks, presets, algorithms and backends."""
+  """Lists the tasks, presets, algorithms and backends."""
 
   contacts: _Flag = False
-  """Report pairs, contact slots, constraint rows and physics steps per second of every
-  scene instead. Takes minutes, as MJX has to compile each."""
+  """Report contacts and physics speed of every scene instead; compiles for minutes."""
 
-  json: _Flag = False
-  """Print one JSON object on standard output and nothing else there."""
+  json: _Json = False
 
 
 def parse(kind: type[T], name: str, argv: Sequence[str], default: T | None = None) -> T:
-  """Parses the options of one command, on top of ``default``.
+  """Parses the options of one command.
 
   Args:
-    kind: one of the dataclasses above.
-    name: the command, for help and errors.
-    argv: what follows it on the command line.
-    default: an instance of ``kind``; its own defaults if None.
+    kind: One of the dataclasses above.
+    name: Command name, for help and errors.
+    argv: Arguments after the command name.
+    default: Defaults of the options; those of ``kind`` if None.
 
   Raises:
-    ConfigError: an unknown, incomplete or unreadable option (tyro's boxed message
-      as one line).
-    SystemExit: ``--help`` was asked for and printed.
+    ConfigError: An option is unknown, incomplete or unreadable; the message is tyro's
+      error box on one line.
+    SystemExit: ``--help`` was given, and the help printed.
   """
   errors = io.StringIO()
   try:
@@ -201,7 +202,7 @@ def parse(kind: type[T], name: str, argv: Sequence[str], default: T | None = Non
         config=(tyro.conf.DisallowNone,),
       )
   except SystemExit as stop:
-    if stop.code in (0, None):  # --help was printed
+    if stop.code in (0, None):  # --help was printed.
       raise
     raise ConfigError(
       f"{_unbox(errors.getvalue())} (see apnpql {name} --help)"
@@ -209,7 +210,7 @@ def parse(kind: type[T], name: str, argv: Sequence[str], default: T | None = Non
 
 
 def _unbox(text: str) -> str:
-  """The message of an error box: its first section, and the first suggestion."""
+  """Returns the message of tyro's error box: its first section and first suggestion."""
   rows = [line.strip("│ ") for line in text.splitlines() if line.startswith("│")]
   sections: list[list[str]] = [[]]
   for row in rows:

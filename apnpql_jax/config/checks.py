@@ -1,13 +1,14 @@
-"""What a configuration must satisfy, checked before anything is built.
+"""Checks of a configuration before anything is built.
 
-Knows no task and no algorithm: what is valid is handed in, so that reading a
-configuration never imports the simulator or the learner.
+The valid tasks and algorithms are passed in, so that reading a configuration imports
+neither the simulator nor the learner.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 import math
+from typing import Any
 
 from apnpql_jax.config import codec
 from apnpql_jax.config.ranges import validate_ranges
@@ -16,26 +17,22 @@ from apnpql_jax.errors import ConfigError, check_name
 
 BACKENDS = ("auto", "mjx", "native")
 OBSERVATIONS = ("pixels", "state")
-TEMPERATURES = ("state", "shared", "fixed")
-REGULARIZERS = ("row", "uniform")
 EVALUATIONS = ("row", "categorical", "td0", "retrace", "clipped_double_q")
-PRIOR_MEANS = ("primitives", "learned")
 IMAGE_FEATURES = ("map", "keypoints", "both")
 
-MIN_BANK_ROWS = 16
-MAX_SHIFT = 16
-"""Pixels."""
-MAX_SIDE = 1024
-"""Pixels."""
-MAX_INSTANTS = 32
-"""A third of an episode of 14 s; a batch has so many times the images."""
-
-_OTHER_BYTES = 4 * (21 + 3 + 7 + 21 + 2) + 2
-"""Robot state, tool, action, primitive labels, reward, log density of the action (f32)
-and the two end flags."""
+_CHOICES = {
+  "env.backend": BACKENDS,
+  "env.obs": OBSERVATIONS,
+  "agent.temperature": ("state", "shared", "fixed"),
+  "agent.regularizer": ("row", "uniform"),
+  "agent.policy_evaluation": EVALUATIONS,
+  "agent.prior_mean": ("primitives", "learned"),
+  "agent.global_features": IMAGE_FEATURES,
+  "agent.wrist_features": IMAGE_FEATURES,
+}
 
 _POSITIVE = (
-  "env.worlds env.time_limit_s env.control_period_s env.bank_rows "
+  "env.worlds env.time_limit_s env.control_period_s "
   "agent.n_step agent.learning_rate_e agent.epsilon "
   "agent.feature_dim agent.max_grad_norm agent.patch_channels agent.conv_channels "
   "agent.ap_delta agent.min_std agent.policy_min_std "
@@ -49,9 +46,24 @@ _NOT_NEGATIVE = (
   "agent.lambda_ap agent.m_step_delay agent.residual_blocks replay.expert_steps "
   "replay.expert_noise seed save_replay_every"
 ).split()
+_BOUNDS = {
+  # A quarter of the bank is held out for evaluation. Bank and atoms are computed on the
+  # host before memory is checked.
+  "env.bank_rows": (16, 1 << 20),
+  "agent.num_atoms": (2, 10_000),
+  "agent.target_samples": (2, math.inf),
+  "agent.policy_samples": (2, math.inf),
+  "agent.image_shift": (0, 16),
+  # A third of an episode of 14 s; a batch holds this many times the images.
+  "agent.lstm_instants": (0, 32),
+  "agent.color_jitter": (0, 1),
+  "replay.expert_share": (0, 1),
+}
+_MAX_SIDE = 1024  # pixels
 
-_AT_MOST = {"env.bank_rows": 1 << 20, "agent.num_atoms": 10_000}
-"""What is computed on the host before memory can be checked."""
+_OTHER_BYTES = 4 * (21 + 3 + 7 + 21 + 2) + 2
+"""Bytes of a slot without images: robot state, tool, action, primitive labels, reward
+and log density of the action (f32), and the two end flags."""
 
 
 def validate(
@@ -62,33 +74,32 @@ def validate(
   memory_bytes: int | None = None,
   devices: int = 1,
 ) -> None:
-  """Refuses a configuration that cannot work, before anything is built.
+  """Checks that a configuration can work.
 
   Args:
-    config: what to check.
-    tasks: valid task names; not checked if None.
-    algorithms: valid algorithm names -> settings of the agent, numbers of candidates,
-      below the log of which epsilon must lie; not checked if None.
-    memory_bytes: memory of a device the replays must fit into; not checked if None.
-    devices: between how many worlds and batches are split.
+    config: Configuration to check.
+    tasks: Valid task names; not checked if None.
+    algorithms: Valid algorithm names, each with the agent settings (numbers of
+      candidates) whose logarithm bounds epsilon; not checked if None.
+    memory_bytes: Memory of one device, which the replays must fit into; not checked if
+      None.
+    devices: Number of devices that share the worlds and batches.
 
   Raises:
-    ConfigError: one line that names the setting and the valid choices or the fix.
+    ConfigError: A setting is invalid. The one-line message names it and the valid
+      choices or the fix.
   """
-  _validate_ranges(config)
-  check_name("env.backend", config.env.backend, BACKENDS)
-  check_name("env.obs", config.env.obs, OBSERVATIONS)
+  _check_values(dict(codec.flatten(config)))
   if tasks is not None:
     check_name("env.task", config.env.task, tasks)
   if algorithms is not None:
     check_name("agent.algorithm", config.agent.algorithm, tuple(algorithms))
-  _validate_env(config.env)
-  _validate_agent(config.agent)
-  _validate_returns(config.agent)
+  _check_env(config.env)
+  _check_agent(config.agent)
   if algorithms is not None and config.agent.temperature != "fixed":
-    _validate_epsilon(config.agent, algorithms[config.agent.algorithm])
-  _validate_expert(config)
-  _validate_replay(config, None if memory_bytes is None else memory_bytes * devices)
+    _check_epsilon(config.agent, algorithms[config.agent.algorithm])
+  _check_expert(config)
+  _check_replay(config, None if memory_bytes is None else memory_bytes * devices)
   for name, number in (
     ("env.worlds", config.env.worlds),
     ("replay.batch_size", config.replay.batch_size),
@@ -98,14 +109,14 @@ def validate(
 
 
 def replay_bytes(config: TrainConfig) -> int:
-  """Bytes the agent and expert replays take at most (points of objects not counted)."""
+  """Returns an upper bound on the bytes of both replays, without object points."""
   images = math.prod(config.env.global_size) + math.prod(config.env.wrist_size)
   slot = _OTHER_BYTES + (3 * images if config.env.obs == "pixels" else 0)
   return slot * (config.replay.capacity + config.replay.expert_steps)
 
 
-def _validate_ranges(config: TrainConfig) -> None:
-  values = dict(codec.flatten(config))
+def _check_values(values: Mapping[str, Any]) -> None:
+  """Checks each setting by itself; ``values`` maps dotted names to values."""
   for name, value in values.items():
     if isinstance(value, float) and not math.isfinite(value):
       raise ConfigError(f"{name}={value} is not a finite number")
@@ -117,94 +128,67 @@ def _validate_ranges(config: TrainConfig) -> None:
   for name in _NOT_NEGATIVE:
     if values[name] < 0:
       raise ConfigError(f"{name}={values[name]} must not be negative")
-  for name, most in _AT_MOST.items():
-    if values[name] > most:
-      raise ConfigError(f"{name}={values[name]} must be at most {most}")
-  if config.env.bank_rows < MIN_BANK_ROWS:
-    raise ConfigError(
-      f"env.bank_rows={config.env.bank_rows} must be at least {MIN_BANK_ROWS}: a "
-      "quarter of them is held out for evaluation"
-    )
-  if config.env.episode_steps < 1:
-    raise ConfigError(
-      f"env.time_limit_s={config.env.time_limit_s} is shorter than one control "
-      f"period; use at least {config.env.control_period_s}"
-    )
+  for name, (low, high) in _BOUNDS.items():
+    if values[name] < low:
+      raise ConfigError(f"{name}={values[name]} must be at least {low}")
+    if values[name] > high:
+      raise ConfigError(f"{name}={values[name]} must be at most {high}")
+  for name, choices in _CHOICES.items():
+    check_name(name, values[name], choices)
 
 
-def _validate_env(env: EnvConfig) -> None:
+def _check_env(env: EnvConfig) -> None:
+  if env.episode_steps < 1:
+    raise ConfigError(
+      f"env.time_limit_s={env.time_limit_s} is shorter than one control period; use at "
+      f"least {env.control_period_s}"
+    )
   for name in ("global_size", "wrist_size"):
     size = getattr(env, name)
-    if len(size) != 2 or min(size) < 1 or max(size) > MAX_SIDE:
+    if len(size) != 2 or min(size) < 1 or max(size) > _MAX_SIDE:
       raise ConfigError(
-        f"env.{name}={size} must be height and width, each from 1 to {MAX_SIDE} pixels"
+        f"env.{name}={size} must be height and width, each from 1 to {_MAX_SIDE} pixels"
       )
   validate_ranges(env.randomization, "env.randomization.")
   delay = env.randomization.delay_s
   if env.randomize and delay >= env.control_period_s:
     raise ConfigError(
       f"env.randomization.delay_s={delay} must be below env.control_period_s="
-      f"{env.control_period_s}: a command is late by less than the next one"
+      f"{env.control_period_s}: a command must take effect before the next one"
     )
 
 
-def _validate_agent(agent: AgentConfig) -> None:
-  check_name("agent.temperature", agent.temperature, TEMPERATURES)
-  check_name("agent.regularizer", agent.regularizer, REGULARIZERS)
-  check_name("agent.policy_evaluation", agent.policy_evaluation, EVALUATIONS)
-  check_name("agent.prior_mean", agent.prior_mean, PRIOR_MEANS)
-  check_name("agent.global_features", agent.global_features, IMAGE_FEATURES)
-  check_name("agent.wrist_features", agent.wrist_features, IMAGE_FEATURES)
+def _check_agent(agent: AgentConfig) -> None:
   for name in ("gamma", "target_rate"):
     if not 0.0 < getattr(agent, name) <= 1.0:
       raise ConfigError(f"agent.{name}={getattr(agent, name)} must be within (0, 1]")
-  for name in ("target_samples", "policy_samples", "num_atoms"):
-    if getattr(agent, name) < 2:
-      raise ConfigError(f"agent.{name}={getattr(agent, name)} must be at least 2")
-  if not 0 <= agent.image_shift <= MAX_SHIFT:
-    raise ConfigError(
-      f"agent.image_shift={agent.image_shift} must be within [0, {MAX_SHIFT}] pixels"
-    )
-  if not 0 <= agent.lstm_instants <= MAX_INSTANTS:
-    raise ConfigError(
-      f"agent.lstm_instants={agent.lstm_instants} must be within [0, {MAX_INSTANTS}]"
-    )
-  if not 0.0 <= agent.color_jitter <= 1.0:
-    raise ConfigError(f"agent.color_jitter={agent.color_jitter} must be within [0, 1]")
   if not agent.hidden or min(agent.hidden) < 1 or max(agent.hidden) >= 2**31:
     raise ConfigError(f"agent.hidden={agent.hidden} must be positive layer widths")
-  for kind in ("", "policy_"):
-    low, start, high = (
-      getattr(agent, f"{kind}{name}") for name in ("min_std", "initial_std", "max_std")
-    )
-    if not low < start < high:
-      raise ConfigError(
-        f"agent.{kind}initial_std={start} must lie between agent.{kind}min_std={low} "
-        f"and agent.{kind}max_std={high}"
-      )
   if not 0.0 < agent.min_prob < 1.0 / 3.0:
     raise ConfigError(f"agent.min_prob={agent.min_prob} must be within (0, 1/3)")
   if not 0.0 < agent.policy_min_prob < 0.5:
     raise ConfigError(
       f"agent.policy_min_prob={agent.policy_min_prob} must be within (0, 1/2)"
     )
-
-
-def _validate_returns(agent: AgentConfig) -> None:
   if agent.v_min >= agent.v_max:
     raise ConfigError(
       f"agent.v_min={agent.v_min} must be below agent.v_max={agent.v_max}"
     )
-  if not agent.v_min < agent.initial_value < agent.v_max:
-    raise ConfigError(
-      f"agent.initial_value={agent.initial_value} must lie between agent.v_min="
-      f"{agent.v_min} and agent.v_max={agent.v_max}"
-    )
+  for low, start, high in (
+    ("min_std", "initial_std", "max_std"),
+    ("policy_min_std", "policy_initial_std", "policy_max_std"),
+    ("v_min", "initial_value", "v_max"),
+  ):
+    if not getattr(agent, low) < getattr(agent, start) < getattr(agent, high):
+      raise ConfigError(
+        f"agent.{start}={getattr(agent, start)} must lie between agent.{low}="
+        f"{getattr(agent, low)} and agent.{high}={getattr(agent, high)}"
+      )
 
 
-def _validate_epsilon(agent: AgentConfig, bounds: Sequence[str]) -> None:
+def _check_epsilon(agent: AgentConfig, bounds: Sequence[str]) -> None:
   # The KL of a distribution over S samples from their uniform weights is at most
-  # log S: a larger limit never binds, and the temperature would run to zero.
+  # log S. A larger limit never binds, and the temperature would run to zero.
   for name in bounds:
     samples = getattr(agent, name)
     if agent.epsilon >= math.log(samples):
@@ -214,12 +198,8 @@ def _validate_epsilon(agent: AgentConfig, bounds: Sequence[str]) -> None:
       )
 
 
-def _validate_expert(config: TrainConfig) -> None:
+def _check_expert(config: TrainConfig) -> None:
   replay = config.replay
-  if not 0.0 <= replay.expert_share <= 1.0:
-    raise ConfigError(
-      f"replay.expert_share={replay.expert_share} must be within [0, 1]"
-    )
   expert = replay.batch_size * replay.expert_share
   if abs(expert - round(expert)) > 1e-6:
     raise ConfigError(
@@ -248,24 +228,23 @@ def _validate_expert(config: TrainConfig) -> None:
     )
 
 
-def _validate_replay(config: TrainConfig, memory_bytes: int | None) -> None:
-  replay, per_iteration = config.replay, config.env.worlds * config.rollout_length
-  if replay.capacity % per_iteration:
+def _check_replay(config: TrainConfig, memory_bytes: int | None) -> None:
+  capacity = config.replay.capacity
+  per_iteration = config.env.worlds * config.rollout_length
+  if capacity % per_iteration:
     raise ConfigError(
-      f"replay.capacity={replay.capacity} must be a multiple of env.worlds * "
-      f"rollout_length = {per_iteration}; use "
-      f"{max(1, round(replay.capacity / per_iteration)) * per_iteration}"
+      f"replay.capacity={capacity} must be a multiple of env.worlds * rollout_length = "
+      f"{per_iteration}; use {max(1, round(capacity / per_iteration)) * per_iteration}"
     )
   fewest = config.agent.n_step + 2 + max(config.agent.lstm_instants - 1, 0)
-  if replay.capacity // config.env.worlds < fewest:
+  if capacity // config.env.worlds < fewest:
     raise ConfigError(
-      f"replay.capacity={replay.capacity} holds no {config.agent.n_step}-step "
-      f"transition; use at least {fewest * config.env.worlds}"
+      f"replay.capacity={capacity} holds no {config.agent.n_step}-step transition; use "
+      f"at least {fewest * config.env.worlds}"
     )
   need = replay_bytes(config)
   if memory_bytes is not None and need > memory_bytes:
     raise ConfigError(
       f"the replays need {need / 2**30:.1f} GiB but the devices have "
-      f"{memory_bytes / 2**30:.1f} GiB; lower replay.capacity or "
-      "replay.expert_steps"
+      f"{memory_bytes / 2**30:.1f} GiB; lower replay.capacity or replay.expert_steps"
     )

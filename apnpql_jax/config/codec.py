@@ -1,7 +1,4 @@
-"""Nested frozen dataclasses to JSON and back, strictly and as data only.
-
-Knows nothing of what the fields mean; ``config`` holds the dataclasses themselves.
-"""
+"""Strict conversion between nested dataclasses and JSON; executes nothing."""
 
 from __future__ import annotations
 
@@ -15,31 +12,26 @@ from apnpql_jax.errors import ConfigError
 T = TypeVar("T")
 
 _BEFORE = "before"
-"""In the metadata of a field: its value in texts that were written without it."""
-
+"""Metadata key of a field: its value in texts written before the field existed."""
 
 _FORMERLY = "formerly"
-"""In the metadata of a field: its name in older texts."""
+"""Metadata key of a field: its name in older texts."""
 
 
 def added(default: Any, *, before: Any = None) -> Any:
-  """A field that came when texts without it existed.
+  """Returns a dataclass field that older texts may lack.
 
   Args:
-    default: its default.
-    before: the value that means what was done without it; the default if None.
+    default: Default of the field.
+    before: Value that reproduces the behavior from before the field existed; the
+      default if None.
   """
   before = default if before is None else before
   return dataclasses.field(default=default, metadata={_BEFORE: before})
 
 
 def renamed(default: Any, *, formerly: str) -> Any:
-  """A field that had another name in older texts.
-
-  Args:
-    default: its default.
-    formerly: the name that ``from_json`` still accepts.
-  """
+  """Returns a dataclass field that ``from_json`` also reads by its former name."""
   return dataclasses.field(default=default, metadata={_FORMERLY: formerly})
 
 
@@ -54,40 +46,42 @@ def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def to_json(config: Any) -> str:
-  """The dataclass as indented JSON text, nested as it is."""
+  """Returns the nested dataclass as indented JSON."""
   return json.dumps(dataclasses.asdict(config), indent=2) + "\n"
 
 
-def unsaid(line: str) -> None:
-  """For those who do not want to be told."""
+def ignore(line: str) -> None:
+  """Discards a message."""
 
 
-def from_json(cls: type[T], text: str, say: Callable[[str], None] = unsaid) -> T:
-  """Reads what ``to_json`` wrote; only data, nothing is executed.
+def from_json(cls: type[T], text: str, warn: Callable[[str], None] = ignore) -> T:
+  """Parses the output of ``to_json``.
 
   Args:
-    cls: the dataclass.
-    text: may have been written before the fields that are ``added``.
-    say: is told in one line which these are, if any.
+    cls: Dataclass to build.
+    text: JSON, possibly written before some ``added`` fields existed.
+    warn: Called with one line that lists the fields the text lacks, if any.
 
   Raises:
-    ConfigError: not JSON, or a key is unknown, missing, or of the wrong type.
+    ConfigError: The text is not JSON, or a key is unknown, missing or of the wrong
+      type.
   """
   try:
-    data = json.loads(text, parse_constant=_refuse_constant)
+    data = json.loads(text, parse_constant=_reject_constant)
   except (ValueError, RecursionError) as error:
     raise ConfigError(f"config is not valid JSON: {str(error)[:200]}") from None
-  lacking: list[str] = []
-  config = _build(cls, data, "", lacking)
-  if lacking:
-    say(f"older than some settings, which are as before: {', '.join(lacking)}")
+  missing: list[str] = []
+  config = _build(cls, data, "", missing)
+  if missing:
+    names = ", ".join(missing)
+    warn(f"older than some settings, which keep their old behavior: {names}")
   return config
 
 
-def _build(cls: type[Any], data: Any, path: str, lacking: list[str]) -> Any:
-  """An instance of dataclass ``cls`` from parsed JSON, every key accounted for.
+def _build(cls: type[Any], data: Any, path: str, missing: list[str]) -> Any:
+  """Returns a dataclass built from parsed JSON, with every key accounted for.
 
-  Appends to ``lacking`` the fields that are missing for good reason.
+  Appends the ``added`` fields that ``data`` lacks to ``missing``.
   """
   if not isinstance(data, dict):
     raise ConfigError(f"config field {path or 'top level'} must be an object")
@@ -104,23 +98,23 @@ def _build(cls: type[Any], data: Any, path: str, lacking: list[str]) -> Any:
   for field in dataclasses.fields(cls):
     key, name = field.name, prefix + field.name
     if key in data:
-      values[key] = _value(hints[key], data[key], name, lacking)
+      values[key] = _value(hints[key], data[key], name, missing)
     elif _BEFORE in field.metadata:
       values[key] = before = field.metadata[_BEFORE]
       group = dataclasses.is_dataclass(before)
-      lacking.append(name if group else f"{name} {before}")
+      missing.append(name if group else f"{name} {before}")
     else:
       raise ConfigError(f"config field {name!r} is missing")
   return cls(**values)
 
 
-def _value(hint: Any, value: Any, path: str, lacking: list[str]) -> Any:
+def _value(hint: Any, value: Any, path: str, missing: list[str]) -> Any:
   if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-    return _build(hint, value, path, lacking)
+    return _build(hint, value, path, missing)
   if get_origin(hint) is tuple and isinstance(value, list):
-    return tuple(_value(get_args(hint)[0], item, path, lacking) for item in value)
-  # bool is an int to Python, and a whole float is written without its point by
-  # other JSON writers: the first is refused, the second is read.
+    return tuple(_value(get_args(hint)[0], item, path, missing) for item in value)
+  # Some JSON writers drop the point of a whole float, so an int is read as one. A bool,
+  # an int to Python, is rejected.
   if hint is float and type(value) is int:
     try:
       return float(value)
@@ -134,5 +128,5 @@ def _value(hint: Any, value: Any, path: str, lacking: list[str]) -> Any:
   return value
 
 
-def _refuse_constant(name: str) -> float:
+def _reject_constant(name: str) -> float:
   raise ValueError(f"{name} is not a number")

@@ -1,7 +1,7 @@
-"""Finds presets and MJCF files by name, in a checkout and in an installed wheel.
+"""Presets, MJCF files and configurations as JSON, in a checkout and in a wheel.
 
 A wheel carries ``experiments/`` and ``mjcf/`` inside the package; in a checkout they
-lie beside it. Names are plain words, so that a name can never leave the folder.
+are next to it. Names are plain words, so that a name cannot lead out of its folder.
 """
 
 from __future__ import annotations
@@ -18,25 +18,24 @@ from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import ConfigError, check_name
 
 _PACKAGE = Path(__file__).resolve().parents[1]
-_NAME = re.compile(r"[a-z0-9_]+")
+_NAME = re.compile(r"[a-z0-9][a-z0-9_]*")
 
 
 def preset_names() -> list[str]:
-  """Names of the presets, sorted; found by listing files, nothing is executed."""
+  """Returns the sorted names of the presets without executing them."""
   return _names("experiments", ".py")
 
 
 def load_preset(name: str) -> TrainConfig:
-  """The ``CONFIG`` of ``experiments/<name>.py``.
+  """Returns the ``CONFIG`` of ``experiments/<name>.py``.
 
   Raises:
-    ConfigError: no such preset, or the file does not define a TrainConfig.
+    ConfigError: There is no such preset, or the file defines no TrainConfig.
   """
   check_name("preset", name, preset_names())
   path = _folder("experiments") / f"{name}.py"
   spec = importlib.util.spec_from_file_location(f"apnpql_preset_{name}", path)
-  if spec is None or spec.loader is None:
-    raise ConfigError(f"preset {name!r} cannot be read from {path}")
+  assert spec is not None and spec.loader is not None
   module = importlib.util.module_from_spec(spec)
   try:
     spec.loader.exec_module(module)
@@ -51,56 +50,52 @@ def load_preset(name: str) -> TrainConfig:
 
 
 def mjcf_path(name: str) -> Path:
-  """Path of ``mjcf/<name>.xml``.
+  """Returns the path of ``mjcf/<name>.xml``.
 
   Raises:
-    ConfigError: no such file.
+    ConfigError: There is no such file.
   """
   check_name("MJCF file", name, _names("mjcf", ".xml"))
   return _folder("mjcf") / f"{name}.xml"
 
 
 def config_to_json(config: TrainConfig) -> str:
-  """The configuration as indented JSON text, nested like the dataclasses."""
+  """Returns the configuration as indented JSON, nested like the dataclasses."""
   return codec.to_json(config)
 
 
 def config_from_json(
-  text: str, say: Callable[[str], None] = codec.unsaid
+  text: str, warn: Callable[[str], None] = codec.ignore
 ) -> TrainConfig:
-  """Reads and validates what ``config_to_json`` wrote; nothing is executed.
+  """Parses and validates the output of ``config_to_json``; executes nothing.
 
   Args:
-    text: the configuration.
-    say: is told in one line which settings came after it was written, if any.
+    text: The configuration as JSON.
+    warn: Called with one line that lists the settings newer than the text, if any.
 
   Raises:
-    ConfigError: not JSON, a key unknown, missing or of the wrong type, or a
-      setting that cannot work.
+    ConfigError: The text is not JSON, a key is unknown, missing or of the wrong type,
+      or a setting is invalid.
   """
-  config = codec.from_json(TrainConfig, text, say)
+  config = codec.from_json(TrainConfig, text, warn)
   validate(config)
   return config
 
 
 def config_diff(a: TrainConfig, b: TrainConfig) -> dict[str, tuple[Any, Any]]:
-  """Dotted field name -> (value in ``a``, value in ``b``) where the two differ."""
+  """Returns dotted field name -> (value in ``a``, value in ``b``) where they differ."""
   other = dict(codec.flatten(b))
   return {k: (v, other[k]) for k, v in codec.flatten(a) if v != other[k]}
 
 
 def format_diff(diff: dict[str, tuple[Any, Any]]) -> str:
-  """One line such as ``agent.gamma 0.99 -> 0.95, seed 0 -> 1``."""
+  """Returns one line such as ``agent.gamma 0.99 -> 0.95, seed 0 -> 1``."""
   return ", ".join(f"{name} {a} -> {b}" for name, (a, b) in diff.items())
 
 
 def _names(folder: str, suffix: str) -> list[str]:
   stems = (path.stem for path in _folder(folder).glob(f"*{suffix}"))
-  return sorted(stem for stem in stems if _is_name(stem))
-
-
-def _is_name(stem: str) -> bool:
-  return bool(_NAME.fullmatch(stem)) and not stem.startswith("_")
+  return sorted(stem for stem in stems if _NAME.fullmatch(stem))
 
 
 def _folder(name: str) -> Path:

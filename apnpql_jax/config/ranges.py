@@ -1,6 +1,6 @@
-"""Ranges of domain randomization (paper Sec. V-C): settings, and how far they may go.
+"""Ranges of domain randomization (paper Sec. V-C) and their limits.
 
-Part of the configuration, hence without JAX; ``worlds`` draws within them.
+Part of the configuration; ``randomization`` draws within them.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ import dataclasses
 from apnpql_jax.config import codec
 from apnpql_jax.errors import ConfigError
 
-MAX_SHARE = 0.5
-"""Largest range of a share: nothing shrinks to nothing."""
+_MAX_RELATIVE = 0.5
+"""Upper limit of the ranges not listed below, as a fraction of the nominal value."""
 
-MAX_ABSOLUTE = {
+_MAX_ABSOLUTE = {
   "color": 1.0,
   "texture": 1.0,
   "light_turn": 0.9,
@@ -26,76 +26,83 @@ MAX_ABSOLUTE = {
   "damping": 2.0,
   "delay_s": 1.0,
 }
-"""Largest ranges of the others, in their units; objects of other sizes and shapes than
-these neither fit into the hand nor into what they are put into."""
+"""Upper limits in the units of the settings. Objects of larger variation in size or
+shape fit neither the hand nor the places they are put into."""
 
 
 @dataclasses.dataclass(frozen=True)
 class RandomizationConfig:
-  """How far each property of a world may be from the scene file (paper Sec. V-C).
+  """Largest deviation of each property from the scene file (paper Sec. V-C).
 
-  Counts where ``randomize`` is set; a range of 0 switches its property off. All are
-  drawn uniformly, per world and episode. A share is of the property's own value.
+  Takes effect with ``randomize``. Deviations are uniform, drawn per world and episode.
+  Relative ranges are fractions of the nominal value; 0 switches a property off.
   """
 
   color: float = 0.15
-  """Red, green and blue of robot, table, background and each object, of 1."""
+  """RGB of robot, table, background and each object, on a scale of 0 to 1."""
 
   texture: float = 0.2
-  """Checkers and noise on robot, table, background and each object: largest change of a
-  color, of 1. A third each are plain, checkered and noisy."""
+  """Largest color change by checkers and noise on robot, table, background and each
+  object, on a scale of 0 to 1. A third each are plain, checkered and noisy."""
 
   light_turn: float = 0.4
-  """Direction of the light, each component of its unit vector."""
+  """Direction of the light: each component of its unit vector."""
 
   light_level: float = 0.3
-  """Ambient and direct light, each a share."""
+  """Ambient and direct light, relative."""
 
   camera_shift: float = 0.02
-  """Position of the global camera along each axis, m; of that on the wrist a tenth."""
+  """Position of the global camera along each axis in m; the wrist camera moves a tenth
+  of this."""
 
   camera_turn: float = 0.02
-  """Orientation of the cameras about each axis, rad."""
+  """Orientation of the cameras about each axis in rad."""
 
   field_of_view: float = 0.03
-  """Field of view of the cameras, a share."""
+  """Field of view of the cameras, relative."""
 
   table_height: float = 0.015
-  """Height of the table under the robot, m."""
+  """Height of the table below the robot in m."""
 
   table_tilt: float = 0.01
-  """Inclination of the table to the robot's base about both level axes, rad."""
+  """Tilt of the table against the robot's base about both horizontal axes in rad."""
 
   table_turn: float = 0.05
-  """Direction of the table, with all that is on it, as seen from the robot, rad."""
+  """Rotation of the table and everything on it about the robot's vertical axis in
+  rad."""
 
   size: float = 0.05
-  """Size of each object, a share."""
+  """Size of each object, relative."""
 
   shape: float = codec.added(0.04, before=0.0)
-  """Height of each object to its width, a share; flip_cup has cups of three shapes
-  anyway."""
+  """Ratio of height to width of each object, relative. flip_cup always draws one of
+  three cup shapes."""
 
   mass: float = 0.3
-  """Mass of each object, a share."""
+  """Mass of each object, relative."""
 
   friction: float = 0.2
-  """Friction of all contacts together, a share."""
+  """One factor on the friction of all contacts, relative."""
 
   damping: float = 0.2
-  """Joint damping added to the robot's, upwards from none, 1/s: torque per velocity and
-  inertia of the joint."""
+  """Joint damping added to the robot's in 1/s (torque per velocity and joint inertia),
+  drawn from 0 to this."""
 
   delay_s: float = 0.03
-  """Time from a command to its effect, upwards from none, s."""
+  """Delay from a command to its effect in seconds, drawn from 0 to this."""
 
   gripper_speed: float = 0.2
-  """Speed of the gripper, a share."""
+  """Speed of the gripper, relative."""
 
 
 def validate_ranges(ranges: RandomizationConfig, prefix: str) -> None:
-  """Raises ConfigError where a range cannot be; ``prefix`` stands before its name."""
+  """Checks that every range is within its limits.
+
+  Raises:
+    ConfigError: A range is negative or too large; the message prepends ``prefix`` to
+      its name.
+  """
   for name, value in codec.flatten(ranges):
-    most = MAX_ABSOLUTE.get(name, MAX_SHARE)
-    if not 0.0 <= value <= most:
-      raise ConfigError(f"{prefix}{name}={value} must be within [0, {most}]")
+    limit = _MAX_ABSOLUTE.get(name, _MAX_RELATIVE)
+    if not 0.0 <= value <= limit:
+      raise ConfigError(f"{prefix}{name}={value} must be within [0, {limit}]")

@@ -130,7 +130,7 @@ def sample(
     windows: also return the N instants after the start; past an end of the episode
       that end again, as what follows may be excluded. Without it
       ``Transition.window`` is None.
-    instants: L; each observation is [B, L, ...], what ``EnvState.seen`` was. 0: that of
+    instants: L; each observation is [B, L, ...], as ``EnvState.observation``. 0: that of
       the instant alone.
 
   Returns:

@@ -16,13 +16,13 @@ from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
 
 FLAT = 0.002
-"""m; what is no thicker lies on the table like a picture, and shadows fall on it."""
+"""m; thinner geoms are flat marks on the table, which receive shadows as it does."""
 
 Renderer = Callable[[Kinematics], Array]
 
 
 def make_cameras(config: EnvConfig, scene: Scene) -> tuple[Renderer, Renderer]:
-  """What the agent sees through: the global camera, and that on the wrist.
+  """Returns the cameras of the agent: the global one and the one on the wrist.
 
   Raises:
     ConfigError: the scene cannot be drawn.
@@ -41,9 +41,8 @@ def camera_renderer(
   height, width = size
   spec = CameraSpec.from_model(scene.model, name, height=height, width=width)
   geoms = Geoms.from_model(scene.model)
-  lighting = Lighting.from_model(
-    scene.model, **(shadows_of_the_hand(scene, geoms) if config.shadows else {})
-  )
+  shadows = shadows_of_the_hand(scene, geoms) if config.shadows else {}
+  lighting = Lighting.from_model(scene.model, **shadows)
 
   def renderer(kinematics: Kinematics) -> Array:
     return render(
@@ -62,20 +61,22 @@ def camera_renderer(
 
 
 def shadows_of_the_hand(scene: Scene, geoms: Geoms) -> dict[str, Any]:
-  """Settings of ``Lighting`` for the hand's shadow on the table and its flat marks."""
+  """Returns the ``Lighting`` settings for the hand's shadow on table and flat marks."""
   model, hand = scene.model, scene.id("body", "gripper")
   in_hand = np.zeros(model.nbody, bool)
   for body in range(hand, model.nbody):  # Parents have lower ids.
     in_hand[body] = body == hand or in_hand[model.body_parentid[body]]
   body, kind = model.geom_bodyid[geoms.ids], geoms.types
   casts = in_hand[body] & np.isin(kind, list(SHADOWS))
+  # What cannot move by itself, and is flat, receives the shadow.
   still = (model.body_rootid[body] == 0) | (model.body_mocapid[body] >= 0)
-  thick = np.where(kind == mujoco.mjtGeom.mjGEOM_BOX, geoms.sizes[:, 2], np.inf)
-  thick[kind == mujoco.mjtGeom.mjGEOM_CYLINDER] = geoms.sizes[
-    kind == mujoco.mjtGeom.mjGEOM_CYLINDER, 1
-  ]
-  thick[kind == mujoco.mjtGeom.mjGEOM_PLANE] = 0.0
-  receives = still & (2 * thick < FLAT)
+  shapes = mujoco.mjtGeom
+  half_height = np.select(
+    [kind == shapes.mjGEOM_BOX, kind == shapes.mjGEOM_CYLINDER],
+    [geoms.sizes[:, 2], geoms.sizes[:, 1]],
+    np.where(kind == shapes.mjGEOM_PLANE, 0.0, np.inf),
+  )
+  receives = still & (2 * half_height < FLAT)
   return {
     "shadow_casters": tuple(geoms.ids[casts].tolist()),
     "shadow_receivers": tuple(geoms.ids[receives].tolist()),

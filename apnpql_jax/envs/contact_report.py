@@ -1,4 +1,4 @@
-"""What the contacts of a task cost: pairs, slots, rows, steps per second."""
+"""The cost of a task's contacts: pairs, slots, constraint rows, steps per second."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from apnpql_jax.tasks import Task
 
 WORLDS = 64
 SUBSTEPS = 30
-"""Physics steps per call that is timed: one control period of 0.15 s at 5 ms."""
+"""Physics steps per timed call: one control period of 0.15 s at 5 ms."""
 
 REPEATS = 3
-"""Calls timed, after one that compiles; the fastest counts."""
+"""Timed calls, after one that compiles; the fastest counts."""
 
 
 def contact_report(
@@ -27,13 +27,13 @@ def contact_report(
   """Measures a task's scene on this machine, with the arm at rest.
 
   Args:
-    task: whose scene.
+    task: the task.
     backends: engines to time.
 
   Returns:
-    pairs, and the contacts and constraint_rows for which MJX has slots, computed at
-    every substep whether they touch or not; native_steps_per_s and mjx_steps_per_s,
-    physics steps summed over worlds.
+    ``pairs``; ``contacts`` and ``constraint_rows``, the slots that MJX computes at
+    every substep whether anything touches or not; ``native_steps_per_s`` and
+    ``mjx_steps_per_s``, physics steps summed over worlds.
   """
   scene = task.scene
   slots = mjx.make_data(scene.model, impl="jax")._impl

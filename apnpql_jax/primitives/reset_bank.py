@@ -1,7 +1,7 @@
 """Reset states with the joint targets of their primitives, built once per task.
 
-Inside jit a reset is then a gather of a random row: true random resets at no cost
-on every backend.
+Inside jit a reset only gathers a random row, so random resets cost nothing on any
+backend.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import concurrent.futures
 import dataclasses
+import functools
 import hashlib
 import inspect
 import json
@@ -17,7 +18,7 @@ import os
 import pathlib
 import tempfile
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from flax import struct
 import jax
@@ -32,60 +33,58 @@ from apnpql_jax.runtime import cache_dir, cores
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.sim.native import NativePhysics
+from apnpql_jax.sim.scene import free_joints
+from apnpql_jax.tasks.task import Task
 from apnpql_jax.types import Array
 
-if TYPE_CHECKING:  # Tasks know the primitives, so only the type may be known here.
-  from apnpql_jax.sim.scene import free_joints
-from apnpql_jax.tasks.task import Task
-
 VERSION = 3
-"""Raised when the meaning of a bank changes; part of the cache key."""
+"""Part of the cache key; increased when the meaning of a bank changes."""
 
 SEED = 0
 CHUNK = 32
 MAX_DRAWS = 20
-"""Draws per row after which a task counts as one without usable resets."""
+"""Draws per row before the task is rejected for lack of usable resets."""
 SETTLE_PERIODS = 4
 """Control periods of 0.15 s at rest before a draw is accepted."""
 SETTLE_SPEED = 0.05
 """m/s and rad/s; above float32 contact noise (0.04)."""
 SETTLE_SHIFT = 0.005
-"""m; what moves further while it settles has been drawn into something else."""
+"""m; an object that moves further while it settles overlapped with another."""
 
 MAX_TRAVEL = 2.5
-"""rad; a joint that had to turn further would pass through another branch of the arm's
-configurations on the way."""
+"""rad; a joint that turns further would pass through another branch of the arm's
+configurations."""
 
 
 class ResetBank(struct.PyTreeNode):
-  """Settled initial states and where their primitives lead."""
+  """Settled initial states and the joint targets of their primitives."""
 
   qpos: Array  # f32[rows, nq]
   mocap_pos: Array  # f32[rows, nmocap, 3]
   mocap_quat: Array  # f32[rows, nmocap, 4]
-  variant: Array  # i32[rows]: of the scene
+  variant: Array  # i32[rows]: variant of the scene
   targets: Array  # f32[rows, 3, 6], rad
 
   @property
   def rows(self) -> int:
-    """Number of reset states."""
+    """Returns the number of reset states."""
     return self.qpos.shape[0]
 
 
 @dataclasses.dataclass
 class BankReport:
-  """How a bank came about."""
+  """Statistics of building a bank."""
 
   drawn: int = 0
-  rejected_restless: int = 0  # moved away or still moving: they overlapped
+  rejected_restless: int = 0  # moved or still moving: objects overlapped
   rejected_unreachable: int = 0
-  max_position_residual: float = 0.0  # m, of mink
-  max_rotation_residual: float = 0.0  # rad
-  seconds: float = 0.0  # to build it
+  max_position_residual: float = 0.0  # m, by mink
+  max_rotation_residual: float = 0.0  # rad, by mink
+  seconds: float = 0.0  # build time
 
   def __str__(self) -> str:
     return (
-      f"{self.drawn:,} drawn, {self.rejected_restless:,} of them restless and "
+      f"{self.drawn:,} drawn; rejected: {self.rejected_restless:,} not at rest, "
       f"{self.rejected_unreachable:,} out of reach; targets within "
       f"{1e3 * self.max_position_residual:.2f} mm and "
       f"{np.degrees(self.max_rotation_residual):.3f} degrees; {self.seconds:.0f} s"
@@ -93,30 +92,29 @@ class BankReport:
 
 
 def load_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
-  """The task's bank from the user's cache, building it first if it is not there."""
+  """Loads the task's bank from the user's cache; builds it first if it is missing."""
   path = _cache_path(task, rows)
   if path.exists():
     with np.load(path, allow_pickle=False) as stored:
-      bank = ResetBank(
-        **{f: jnp.asarray(stored[f]) for f in ResetBank.__dataclass_fields__}
-      )
-      return bank, BankReport(**json.loads(str(stored["report"])))
+      arrays = dict(stored)
+    report = BankReport(**json.loads(str(arrays.pop("report"))))
+    return ResetBank(**jax.tree.map(jnp.asarray, arrays)), report
   bank, report = build_bank(task, rows)
   _store(path, bank, report)
   return bank, report
 
 
 def build_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
-  """Draws, settles and solves ``rows`` reset states; progress and report on stderr.
+  """Draws, settles and solves ``rows`` reset states; shows progress on stderr.
 
   Raises:
-    ConfigError: too many draws are rejected.
+    ConfigError: too many draws were rejected.
   """
   began = time.monotonic()
   rng = np.random.default_rng(SEED)
   report = BankReport()
   kept: list[ResetBank] = []
-  # Spawned workers: forking a process in which XLA threads run can deadlock.
+  # Spawn, because forking a process in which XLA threads run can deadlock.
   context = multiprocessing.get_context("spawn")
   with (
     concurrent.futures.ProcessPoolExecutor(cores(), context) as pool,
@@ -130,9 +128,8 @@ def build_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
       state, variant = _settled(task, rng, max(missing, CHUNK), report)
       if not len(variant):
         continue
-      solved = _solve_targets(
-        task, state, variant, pool, report, lambda n: progress.advance(bar, n)
-      )
+      advance = functools.partial(progress.advance, bar)
+      solved = _solve_targets(task, state, variant, pool, report, advance)
       kept.append(jax.tree.map(lambda x: x[:missing], solved))
     report.seconds = time.monotonic() - began
     progress.console.print(f"reset bank of {task.name}: {report}", highlight=False)
@@ -142,7 +139,7 @@ def build_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
 def _settled(
   task: Task, rng: np.random.Generator, count: int, report: BankReport
 ) -> tuple[physics.PhysicsState, Array]:
-  """States that stay where they are while the arm holds still, and their variants."""
+  """Returns drawn states that stay at rest while the arm holds still, and variants."""
   draw = jax.tree.map(jnp.asarray, task.sample_resets(rng, count))
   state = physics.initial_state(task.scene, *draw)
   engine = NativePhysics(task.scene, substeps=30)
@@ -170,16 +167,15 @@ def _solve_targets(
   kinematics = jax.jit(make_kinematics(task.scene))(state)
   positions, rotations, _ = map(np.asarray, task.tool_targets(state, kinematics))
   starts = np.asarray(state.qpos[:, task.scene.arm_qpos])
-  chunks = [slice(i, i + CHUNK) for i in range(0, len(starts), CHUNK)]
+  arrays = starts, positions, rotations
   futures = [
-    pool.submit(ik.solve_all, starts[c], positions[c], rotations[c]) for c in chunks
+    pool.submit(ik.solve_all, *(x[i : i + CHUNK] for x in arrays))
+    for i in range(0, len(starts), CHUNK)
   ]
   for future in concurrent.futures.as_completed(futures):
     advance(len(future.result()[0]))
-  targets, residuals = (
-    np.concatenate(parts)
-    for parts in zip(*[future.result() for future in futures], strict=True)
-  )
+  solved = zip(*[future.result() for future in futures], strict=True)
+  targets, residuals = map(np.concatenate, solved)
   reached = (residuals < [ik.POSITION_TOLERANCE, ik.ROTATION_TOLERANCE]).all((1, 2))
   reached &= np.abs(targets - starts[:, None]).max((1, 2)) < MAX_TRAVEL
   report.rejected_unreachable += int((~reached).sum())
@@ -204,21 +200,19 @@ def _cache_path(task: Task, rows: int) -> pathlib.Path:
 
 
 def _source(task: Task) -> str:
-  """Hash of the task's file and of what tasks share: they decide what a bank holds."""
+  """Returns a hash of the task's file and of the files shared by tasks."""
   own = pathlib.Path(inspect.getfile(type(task)))
   digest = hashlib.sha256(own.read_bytes())
   for path in sorted(own.parent.glob("*.py")):
-    if "\n@register\n" not in (text := path.read_text(encoding="utf-8")):
+    if "\n@register_task\n" not in (text := path.read_text(encoding="utf-8")):
       digest.update(text.encode())
   return digest.hexdigest()
 
 
 def _store(path: pathlib.Path, bank: ResetBank, report: BankReport) -> None:
-  """Writes atomically, so that two runs at once never see half a file."""
+  """Writes atomically, so that no concurrent run reads an incomplete file."""
   path.parent.mkdir(parents=True, exist_ok=True)
-  arrays: dict[str, Any] = {
-    f: np.asarray(getattr(bank, f)) for f in ResetBank.__dataclass_fields__
-  }
+  arrays: dict[str, Any] = jax.tree.map(np.asarray, vars(bank))
   with tempfile.NamedTemporaryFile(
     dir=path.parent, suffix=".npz", delete=False
   ) as file:

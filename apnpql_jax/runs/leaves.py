@@ -63,7 +63,7 @@ def checksums(tree: Any) -> dict[str, int]:
 
   All processes that hold parts of the leaves must ask for them together.
   """
-  devices.meet()
+  devices.barrier()
   return {path: _crc32(_key_data(leaf)) for path, leaf in named(tree).items()}
 
 

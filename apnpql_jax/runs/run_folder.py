@@ -118,7 +118,7 @@ def new_run_dir(preset: str, root: Path = Path("runs")) -> Path:
 
 
 def load_run_config(
-  run_dir: Path, say: Callable[[str], None] = codec.unsaid
+  run_dir: Path, say: Callable[[str], None] = codec.ignore
 ) -> TrainConfig:
   """The configuration that a run was started with.
 

@@ -13,7 +13,7 @@ from apnpql_jax.sim.scene import Scene
 
 
 def make_physics(name: str, scene: Scene, *, substeps: int) -> Physics:
-  """Engine ``name``; "auto" takes C MuJoCo on a bare CPU and MJX elsewhere.
+  """Builds an engine; "auto" is C MuJoCo if JAX runs on the CPU, and MJX elsewhere.
 
   Raises:
     ConfigError: unknown name.
@@ -21,6 +21,5 @@ def make_physics(name: str, scene: Scene, *, substeps: int) -> Physics:
   check_name("backend", name, BACKENDS)
   if name == "auto":
     name = "native" if jax.default_backend() == "cpu" else "mjx"
-  if name == "native":
-    return NativePhysics(scene, substeps=substeps)
-  return MjxPhysics(scene, substeps=substeps)
+  engine = NativePhysics if name == "native" else MjxPhysics
+  return engine(scene, substeps=substeps)

@@ -105,7 +105,7 @@ def evaluate(
   env = make_env(env_config, instants=config.agent.lstm_instants)
   agent = make_agent(config.agent)
   example = jax.eval_shape(
-    lambda rows: agent.init(jax.random.key(0), env.reset(rows).seen),
+    lambda rows: agent.init(jax.random.key(0), env.reset(rows).observation),
     jnp.zeros(1, jnp.int32),
   )
   devices.check_memory(leaves.nbytes(example), "the learner")

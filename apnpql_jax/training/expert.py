@@ -15,7 +15,7 @@ from apnpql_jax.data import demonstrations, replay
 from apnpql_jax.data.demonstrations import Demonstrations
 from apnpql_jax.data.replay import Replay
 from apnpql_jax.envs.env import Env, make_env
-from apnpql_jax.envs.state import EnvState
+from apnpql_jax.envs.state import Arrival, EnvState
 from apnpql_jax.errors import FileError
 from apnpql_jax.primitives import ik
 from apnpql_jax.sim import physics
@@ -104,7 +104,7 @@ def replay_from_demonstrations(
     def instant(before: EnvState, seen: tuple) -> tuple[EnvState, Slot]:
       rows, fresh, targets, ends = seen
       now = _states(demos, env.task.scene, rows)
-      state = env.arrive(env.after(before, now, targets, fresh))
+      state = env.observe(Arrival.after(before, now, targets, fresh))
       timestep = state.timestep
       timestep = timestep.replace(
         truncated=timestep.truncated | ends & ~timestep.terminated

@@ -58,7 +58,7 @@ def write(path: Path, config: TrainConfig, state: TrainState) -> None:
   arrays: dict[str, Any] = multihost_utils.process_allgather(
     leaves.named(leaves.to_plain(update)), tiled=True
   )
-  if devices.leads():
+  if devices.is_primary():
     np.savez(path, **arrays)
 
 

@@ -30,7 +30,7 @@ def agent_policy(agent: Agent, params: Params, *, greedy: bool) -> Policy:
   """The learned policy; sees observations only."""
 
   def policy(state: EnvState, key: Array) -> tuple[Array, Array]:
-    action, info = agent.act(params, state.seen, key, greedy)
+    action, info = agent.act(params, state.observation, key, greedy)
     return action, info["log_prob"]
 
   return policy
@@ -99,7 +99,7 @@ def make_player(env: Env, make_policy: Callable[[Any], Policy]) -> Player:
 
     def instant(carry):
       now, played, running, time, key = carry
-      state = env.arrive(now)
+      state = env.observe(now)
       running &= state.faults == 0
       played = Episodes(
         success=played.success | running & state.timestep.terminated,

@@ -50,7 +50,7 @@ def initial_state(
   ) -> TrainState:
     length = config.replay.capacity // config.env.worlds
     state = TrainState(
-      learner=agent.init(init_key, worlds.seen),
+      learner=agent.init(init_key, worlds.observation),
       env=worlds,
       replay=replay.create(example_slot(worlds), length, config.env.worlds),
       expert_replay=None,

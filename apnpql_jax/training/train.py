@@ -106,14 +106,14 @@ def _run(
   """Opens what is written to, and trains; returns the last evaluation too."""
   path = start.folder.path
   with (
-    run_folder.lock(path) if devices.leads() else contextlib.nullcontext(),
+    run_folder.lock(path) if devices.is_primary() else contextlib.nullcontext(),
     _reporting(config, start) as reporter,
     CheckpointWriter(path, config, keep=config.keep_checkpoints) as saver,
   ):
     iteration: Any = make_iteration(config, start.env, start.agent)
     if start.env.mesh is not None:
       iteration = iteration.lower(start.state).compile()
-      devices.meet()
+      devices.barrier()
     state = _loop(config, iteration, start.state, reporter, saver, signals)
     if figures := saver.finished(wait=True):
       reporter.write(int(state.env_steps), figures)
@@ -125,8 +125,8 @@ def _reporting(
   config: TrainConfig, start: Start
 ) -> Generator[Reporter | Silent, None, None]:
   """Opens the metrics and the progress; of several processes, the first one tells."""
-  devices.first_alone(lambda: _set_aside(start))
-  if not devices.leads():
+  devices.run_on_primary(lambda: _set_aside(start))
+  if not devices.is_primary():
     yield Silent(start.folder)
     return
   path = start.folder.path
@@ -179,7 +179,7 @@ def _start(
   if resume:
     _say("it was stopped before its first checkpoint, and begins again")
     return Start(env, agent, folder, state, 0)
-  devices.first_alone(
+  devices.run_on_primary(
     lambda: run_folder.create(run_dir, config, overwrite=overwrite, devices=count)
   )
   return Start(env, agent, run_folder.open_run(run_dir), state, None)
@@ -210,10 +210,10 @@ def _loop(config, iteration, state, reporter, saver, signals) -> TrainState:
     done = step >= config.total_steps
     rate = None
     # Who sends a signal may not wait for an evaluation before the state is safe.
-    stop = devices.anywhere(signals.caught)
+    stop = devices.any_process(signals.caught)
     if not stop and (done or _passed(before, step, config.eval_every)):
       rate = reporter.evaluate(step, state, last=done)
-      stop = devices.anywhere(signals.caught)
+      stop = devices.any_process(signals.caught)
     last = done or stop
     whole = _passed(before, step, config.save_replay_every or config.checkpoint_every)
     if last or whole or _passed(before, step, config.checkpoint_every):
@@ -223,7 +223,7 @@ def _loop(config, iteration, state, reporter, saver, signals) -> TrainState:
 
 
 def _say(text: str) -> None:
-  if devices.leads():
+  if devices.is_primary():
     say(text)
 
 

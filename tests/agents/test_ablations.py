@@ -5,13 +5,12 @@ from __future__ import annotations
 import functools
 from typing import Any, NamedTuple
 
-from batches import random_batch
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import tiny
 
+from apnpql_jax import testing
 from apnpql_jax.agents.learner import Agent, LearnerState, make_agent
 from apnpql_jax.cli.options import Train, parse
 from apnpql_jax.config import files
@@ -19,6 +18,7 @@ from apnpql_jax.config.checks import validate
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.data import replay
 from apnpql_jax.dists.gmm import GripperGMM
+from apnpql_jax.testing import random_batch
 from apnpql_jax.training.iteration import make_sample
 from apnpql_jax.types import Metrics
 
@@ -70,7 +70,7 @@ class Played(NamedTuple):
 def configured(flags: str) -> TrainConfig:
   base = Train(config=files.load_preset("push_plate"))
   # An entropy below its floor, so that nu has something to do from the first update.
-  args = [*tiny.PRESET_ARGS, "--agent.epsilon-nu", "5", *flags.split()]
+  args = [*testing.TINY_ARGS, "--agent.epsilon-nu", "5", *flags.split()]
   config = parse(Train, "train", ["push_plate", *args], default=base).config
   validate(config)
   return config
@@ -82,7 +82,7 @@ def play(flags: str) -> Played:
   agent, batch = make_agent(config.agent), random_batch(0, BATCH)
   before = agent.init(jax.random.key(0), batch.observation_tm1)
   with jax.numpy_rank_promotion("raise"):
-    update = jax.jit(agent.update, compiler_options=tiny.FAST_COMPILE)
+    update = jax.jit(agent.update, compiler_options=testing.FAST_COMPILE)
     after, metrics = update(before, batch, jax.random.key(1))
   return Played(config, agent, before, after, metrics)
 

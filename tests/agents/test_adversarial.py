@@ -6,15 +6,15 @@ import dataclasses
 import functools
 from typing import Any
 
-from batches import SMALL, random_batch
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import tiny
 
+from apnpql_jax import testing
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.agents.table_one import ALGORITHMS
+from apnpql_jax.testing import SMALL, random_batch
 from apnpql_jax.types import Array, Transition
 
 BATCH, ROWS = 6, 32
@@ -67,7 +67,7 @@ def test_no_batch_makes_a_number_that_is_none(name: str, updates: int):
     rich = jnp.abs(batch.reward_t) > 1e5
     return state, (metrics, jnp.any(white & rich))
 
-  @functools.partial(jax.jit, compiler_options=tiny.FAST_COMPILE)
+  @functools.partial(jax.jit, compiler_options=testing.FAST_COMPILE)
   def run(state):
     keys = jax.random.split(jax.random.key(1), updates)
     state, seen = jax.lax.scan(body, state, keys)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-from batches import random_batch
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +12,7 @@ import pytest
 from apnpql_jax.agents.augmentation import augment, jitter_colors, shift_images
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config.schema import AgentConfig
+from apnpql_jax.testing import random_batch
 
 IMAGES = np.random.default_rng(0).integers(0, 256, (3, 5, 12, 16, 3)).astype(np.uint8)
 CONFIG = AgentConfig(

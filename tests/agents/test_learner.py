@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-from batches import random_batch
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +14,7 @@ from apnpql_jax.agents.learner import make_agent, make_optimizer
 from apnpql_jax.agents.table_one import ALGORITHMS
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.errors import ConfigError
+from apnpql_jax.testing import random_batch
 
 CONFIG = AgentConfig(
   hidden=(32, 32),

@@ -7,16 +7,16 @@ import dataclasses
 import functools
 from typing import Any
 
-from batches import random_batch
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tiny
 
+from apnpql_jax import testing
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.data import replay
 from apnpql_jax.data.replay import Replay
+from apnpql_jax.testing import random_batch
 from apnpql_jax.types import Observation, Slot, TimeStep
 
 CONFIG = AgentConfig(
@@ -34,7 +34,7 @@ CONFIG = AgentConfig(
 def called(function: Callable, *args: Any) -> Any:
   """What it returns for these arguments; compiled in a hurry, as it is called once."""
   lowered: Any = jax.jit(function).lower(*args)
-  return lowered.compile(compiler_options=tiny.FAST_COMPILE)(*args)
+  return lowered.compile(compiler_options=testing.FAST_COMPILE)(*args)
 
 
 def episodes(steps: int = 64, worlds: int = 16) -> Replay:

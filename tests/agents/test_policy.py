@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from batches import random_batch
 from densities import scipy_log_prob
 import jax
 import jax.numpy as jnp
@@ -20,6 +19,7 @@ from apnpql_jax.agents.heads import GROUPS, Heads
 from apnpql_jax.agents.networks import make_networks
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.dists.action import UniformBox
+from apnpql_jax.testing import random_batch
 
 CONFIG = AgentConfig(hidden=(8, 8), feature_dim=8, policy_samples=400)
 STATES = 16

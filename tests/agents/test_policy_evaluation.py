@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from batches import random_batch
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +16,7 @@ from apnpql_jax.agents.learner import bellman_target, make_agent
 from apnpql_jax.agents.table_one import algorithm_of
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.errors import ConfigError
+from apnpql_jax.testing import random_batch
 
 N = 4
 BATCH = 5

@@ -7,15 +7,14 @@ import dataclasses
 import functools
 from typing import Any, NamedTuple
 
-from batches import SMALL, random_batch
 from densities import scipy_log_prob
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import special
-import tiny
 
+from apnpql_jax import testing
 from apnpql_jax.agents import table_one
 from apnpql_jax.agents.columns import regularizer
 from apnpql_jax.agents.columns.candidates import clip_action
@@ -24,6 +23,7 @@ from apnpql_jax.agents.learner import Agent, bellman_target, make_agent, total_l
 from apnpql_jax.agents.table_one import ALGORITHMS, algorithm_of
 from apnpql_jax.config import checks
 from apnpql_jax.dists.action import ActionDistribution, UniformBox
+from apnpql_jax.testing import SMALL, random_batch
 from apnpql_jax.types import Array, Metrics, Transition
 
 BATCH = 6
@@ -110,7 +110,7 @@ def example_of(name: str) -> Example:
 
   with jax.numpy_rank_promotion("raise"):
     learn = jax.jit(
-      jax.jacrev(losses, has_aux=True), compiler_options=tiny.FAST_COMPILE
+      jax.jacrev(losses, has_aux=True), compiler_options=testing.FAST_COMPILE
     )
     learn(trained, batch)
   return Example(agent, batch, trained, slow, functools.partial(learn, trained))

@@ -23,8 +23,8 @@ import resume
 import soak
 import tables
 import timing
-import tiny
 
+from apnpql_jax import testing
 from apnpql_jax.runs.metrics import MetricWriter
 
 PEAK = {"flops_per_s": 2e9, "bytes_per_s": 1e9}
@@ -43,7 +43,7 @@ def run(script: str, *args: str) -> dict[str, Any]:
   done = subprocess.run(
     [sys.executable, f"benchmarks/{script}.py", "--quick", "--json", *args],
     cwd=tables.ROOT,
-    env=os.environ | {"XLA_FLAGS": tiny.XLA_FLAGS, "PYTHONPATH": str(tables.ROOT)},
+    env=os.environ | {"XLA_FLAGS": testing.XLA_FLAGS, "PYTHONPATH": str(tables.ROOT)},
     capture_output=True,
     text=True,
     check=False,
@@ -178,10 +178,10 @@ def test_the_soak_sees_metrics_that_were_put_aside_and_every_other_loss(tmp_path
     (tmp_path / name).mkdir()
     with MetricWriter(tmp_path / name, max_bytes=500) as writer:
       for i, loss in enumerate(values, start=1 if name != "gap" else 2):
-        writer.write(i * tiny.STEPS, {"loss/q": loss})
-        writer.write(i * tiny.STEPS, {"checkpoint/mib": 1.0})
+        writer.write(i * testing.STEPS, {"loss/q": loss})
+        writer.write(i * testing.STEPS, {"checkpoint/mib": 1.0})
   assert (tmp_path / "long" / "metrics.3.jsonl").exists()
-  assert soak.reached(tmp_path / "short") == 30 * tiny.STEPS
+  assert soak.reached(tmp_path / "short") == 30 * testing.STEPS
   long, short, gap, other = (tmp_path / name for name in runs)
   assert soak.same_metrics(long, short)
   assert not soak.same_metrics(long, gap) and not soak.same_metrics(gap, gap)

@@ -153,9 +153,8 @@ def test_ratios_are_reported_or_why_there_are_none(capsys):
 @pytest.fixture(scope="module")
 def parameters() -> int:
   """Number of parameters of push_plate's networks."""
-  from batches import random_batch
-
   from apnpql_jax.agents.learner import make_agent
+  from apnpql_jax.testing import random_batch
 
   agent = make_agent(load_preset("push_plate").agent)
   example = random_batch(0, 1, pixels=True).observation_tm1

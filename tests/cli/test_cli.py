@@ -89,7 +89,7 @@ BAD_INPUT = [
   ("evaluate runs/old --seed -1", ["--seed"]),
   ("evaluate runs/old --checkpoint last", ["'last'", "newest", "best"]),
   ("evaluate runs/old", ["no checkpoint"]),
-  ("convert", ["RECORDING.npz", "TASK", "OUT.npz"]),
+  ("convert", ["REC.npz", "TASK", "OUT.npz"]),
   ("convert none.npz juggle out.npz", ["'juggle'", "push_plate"]),
   ("convert none.npz push_plate out.npz", ["none.npz", "no archive"]),
   ("repeat", ["RUN/faults/step_<n>.npz"]),
@@ -133,7 +133,7 @@ def test_a_run_from_before_a_setting_is_taken_as_it_was(run_dir, tmp_path):
     done = apnpql(*command.split(), cwd=tmp_path)
     assert done.returncode == 2
     told, refused = done.stderr.splitlines()
-    assert told.endswith("which are as before: agent.residual_blocks 0")
+    assert told.endswith("which keep their old behavior: agent.residual_blocks 0")
     assert "no checkpoint" in refused or "seed 0 -> 9" in refused
 
 

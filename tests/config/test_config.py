@@ -1,4 +1,4 @@
-"""Configurations: what is refused, and that JSON gives back what it was given."""
+"""Configurations: invalid ones are rejected, and JSON round trips are exact."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from apnpql_jax.errors import ConfigError
 
 POSITIVE = st.floats(1e-6, 1e6, allow_nan=False)
 
-LATER = {
+ADDED = {
   "env.global_size": (72, 96),
   "env.wrist_size": (36, 64),
   "env.shadows": False,
@@ -40,12 +40,12 @@ LATER = {
   "agent.color_jitter": 0.0,
   "replay.demonstrations": "",
 }
-"""What runs did before these settings came. No value may ever change here: if a default
-does, ``codec.added`` has to be told."""
+"""Behavior of runs from before these settings existed. No value may ever change here: if
+a default does, pass the old one to ``codec.added``."""
 
 
 def changed(path: str, value: object) -> TrainConfig:
-  """The default configuration with one dotted field replaced."""
+  """Returns the default configuration with one dotted field replaced."""
   return replaced(TrainConfig(), path.split("."), value)
 
 
@@ -56,7 +56,7 @@ def replaced(config, names, value):
 
 
 def edited(path: str, value: object) -> str:
-  """The default configuration as JSON with one dotted key set, or removed by ``...``"""
+  """Returns the default configuration as JSON with one key set, or removed by ``...``."""
   data = json.loads(config_to_json(TrainConfig()))
   *parents, last = path.split(".")
   node = data
@@ -113,11 +113,11 @@ def test_every_field_has_a_docstring():
     ("agent.gamma", 1.5, ["(0, 1]"]),
     ("agent.v_min", 1.0, ["agent.v_max"]),
     ("agent.hidden", (), ["agent.hidden"]),
-    ("agent.lstm_instants", 33, ["[0, 32]"]),
+    ("agent.lstm_instants", 33, ["at most 32"]),
     ("agent.target_samples", 1, ["at least 2"]),
     ("agent.learning_rate_e", float("inf"), ["finite"]),
     ("replay.expert_share", 0.3, ["replay.batch_size", "0.296875"]),
-    ("replay.expert_share", 1.5, ["[0, 1]"]),
+    ("replay.expert_share", 1.5, ["at most 1"]),
     ("replay.expert_steps", 0, ["expert_share=0"]),
     ("replay.expert_noise", -0.1, ["negative"]),
     ("replay.capacity", 51_201, ["256", "use 51200"]),
@@ -129,7 +129,7 @@ def test_every_field_has_a_docstring():
     ("env.time_limit_s", 0.1, ["0.15"]),
   ],
 )
-def test_refusals_name_the_setting_and_the_fix(path, value, words):
+def test_errors_name_the_setting_and_the_fix(path, value, words):
   with pytest.raises(ConfigError) as error:
     validate(
       changed(path, value),
@@ -143,18 +143,18 @@ def test_refusals_name_the_setting_and_the_fix(path, value, words):
 
 
 @pytest.mark.parametrize(
-  ("epsilon", "weighed"),
+  ("epsilon", "bounds"),
   [
     (math.log(100) - 1e-6, ("target_samples", "policy_samples")),
     (math.log(120) - 1e-6, ("target_samples",)),
     (9.0, ()),
   ],
 )
-def test_epsilon_is_bounded_only_where_candidates_are_weighed(epsilon, weighed):
-  validate(changed("agent.epsilon", epsilon), algorithms={"ap_npql": weighed})
+def test_epsilon_is_bounded_only_where_candidates_are_weighted(epsilon, bounds):
+  validate(changed("agent.epsilon", epsilon), algorithms={"ap_npql": bounds})
 
 
-def test_a_fixed_temperature_keeps_no_limit():
+def test_a_fixed_temperature_enforces_no_limit():
   agent = dataclasses.replace(AgentConfig(), epsilon=9.0, temperature="fixed")
   validate(TrainConfig(agent=agent), algorithms={"ap_npql": ("policy_samples",)})
 
@@ -169,19 +169,19 @@ def test_defaults_of_the_learner_are_the_constants_of_the_paper():
   assert (agent.hidden, agent.num_atoms) == ((256, 256), 51)
 
 
-def test_replay_that_holds_no_transition_is_refused():
+def test_replay_without_room_for_a_transition_is_rejected():
   config = TrainConfig(replay=ReplayConfig(capacity=128), rollout_length=1)
   with pytest.raises(ConfigError, match="use at least 160"):
     validate(config)
   validate(changed("replay.capacity", 256))
 
 
-def test_replay_larger_than_memory_is_refused():
+def test_replay_larger_than_memory_is_rejected():
   need = replay_bytes(TrainConfig())
   validate(TrainConfig(), memory_bytes=need)
   with pytest.raises(ConfigError, match="GiB.*replay.capacity"):
     validate(TrainConfig(), memory_bytes=need - 1)
-  # Two images of three bytes a pixel, in every slot of both replays.
+  # Two images of three bytes per pixel in every slot of both replays.
   slots = 51_200 + 6_400
   assert need > slots * 3 * (72 * 96 + 36 * 64)
   assert replay_bytes(changed("env.obs", "state")) < need / 100
@@ -190,14 +190,14 @@ def test_replay_larger_than_memory_is_refused():
   assert large - need == 3 * (120 * 160 - 72 * 96) * slots
 
 
-def test_a_replay_must_hold_what_an_lstm_looks_back_on():
-  config = changed("replay.capacity", 256)  # Eight instants of each world.
+def test_a_replay_must_hold_the_window_of_an_lstm():
+  config = changed("replay.capacity", 256)  # Eight time steps per world.
   validate(replaced(config, ["agent", "lstm_instants"], 4))
   with pytest.raises(ConfigError, match="replay.capacity=256 .* at least 288"):
     validate(replaced(config, ["agent", "lstm_instants"], 5))
 
 
-def test_demonstrations_do_not_show_randomized_worlds():
+def test_demonstrations_exclude_randomized_worlds():
   config = TrainConfig(
     env=EnvConfig(randomize=True), replay=ReplayConfig(demonstrations="mine.npz")
   )
@@ -205,7 +205,7 @@ def test_demonstrations_do_not_show_randomized_worlds():
     validate(config)
 
 
-def test_a_command_may_not_be_later_than_the_next_one():
+def test_a_command_must_take_effect_before_the_next_one():
   env = EnvConfig(randomize=True, randomization=RandomizationConfig(delay_s=0.15))
   with pytest.raises(ConfigError, match="delay_s=0.15 must be below.*=0.15"):
     validate(TrainConfig(env=env))
@@ -265,37 +265,37 @@ def test_json_is_read_strictly(text, words):
     assert word in str(error.value)
 
 
-def test_a_setting_that_came_later_is_as_before_where_it_is_missing():
-  for path, before in LATER.items():
-    said: list[str] = []
-    config = config_from_json(edited(path, ...), said.append)
+def test_a_missing_setting_that_was_added_later_keeps_the_old_behavior():
+  for path, before in ADDED.items():
+    warnings: list[str] = []
+    config = config_from_json(edited(path, ...), warnings.append)
     assert config == replaced(TrainConfig(), path.split("."), before)
-    (line,) = said
+    (line,) = warnings
     assert line.count(path) == 1 and "\n" not in line
   data = json.loads(config_to_json(TrainConfig()))
-  old = {k: v for k, v in data["agent"].items() if f"agent.{k}" not in LATER}
-  said = []
-  assert config_from_json(json.dumps(data | {"agent": old}), said.append)
-  assert said[0].endswith("agent.image_shift 0, agent.color_jitter 0.0")
+  old = {k: v for k, v in data["agent"].items() if f"agent.{k}" not in ADDED}
+  warnings = []
+  assert config_from_json(json.dumps(data | {"agent": old}), warnings.append)
+  assert warnings[0].endswith("agent.image_shift 0, agent.color_jitter 0.0")
   assert config_from_json(config_to_json(TrainConfig()), pytest.fail)
 
 
-def test_a_renamed_setting_is_read_under_its_former_name():
+def test_a_renamed_setting_is_read_by_its_former_name():
   config = replaced(TrainConfig(), ["agent", "regularizer"], "uniform")
   text = config_to_json(config)
   assert '"regularizer": "uniform"' in text
   assert config_from_json(text.replace("regularizer", "regulariser")) == config
 
 
-def test_any_other_setting_that_is_missing_is_refused_by_name():
+def test_any_other_missing_setting_is_rejected_by_name():
   paths = [name for name, _ in codec.flatten(TrainConfig())] + ["env", "agent"]
   for path in paths:
-    if path not in LATER:
+    if path not in ADDED:
       with pytest.raises(ConfigError, match=f"'{path}' is missing"):
         config_from_json(edited(path, ...), pytest.fail)
 
 
-def test_diff_names_exactly_what_differs():
+def test_diff_lists_exactly_what_differs():
   a = TrainConfig()
   b = replaced(changed("agent.gamma", 0.9), ["seed"], 5)
   assert config_diff(a, b) == {"agent.gamma": (0.99, 0.9), "seed": (0, 5)}

@@ -1,4 +1,4 @@
-"""Presets found by name; the folders are read where the package lies."""
+"""Lookup of presets and scenes by name, in a checkout and in a wheel."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from apnpql_jax.errors import ConfigError
 
 @pytest.fixture
 def package(tmp_path: Path, monkeypatch) -> Path:
-  """An empty package folder, as in a checkout: its folders lie beside it."""
+  """Creates an empty package folder; as in a checkout, its folders are next to it."""
   folder = tmp_path / "apnpql_jax"
   folder.mkdir()
   monkeypatch.setattr(files, "_PACKAGE", folder)
@@ -25,7 +25,7 @@ def write(folder: Path, name: str, text: str) -> None:
   (folder / name).write_text(text)
 
 
-def test_names_are_plain_words_in_order(package):
+def test_names_are_plain_words_and_sorted(package):
   folder = package.parent / "experiments"
   for name in ("b.py", "a_2.py", "_private.py", "__init__.py", "Big.py", "c-d.py"):
     write(folder, name, "raise RuntimeError('listing must not run this')")
@@ -39,7 +39,7 @@ def test_installed_folder_is_preferred(package):
   assert files.preset_names() == ["inside"]
 
 
-def test_configuration_of_a_preset_is_loaded(package):
+def test_preset_is_loaded(package):
   text = "from apnpql_jax import TrainConfig\nCONFIG = TrainConfig(seed=7)"
   write(package.parent / "experiments", "seven.py", text)
   assert files.load_preset("seven") == TrainConfig(seed=7)
@@ -54,14 +54,14 @@ def test_configuration_of_a_preset_is_loaded(package):
     ("CONFIG = (", "SyntaxError"),
   ],
 )
-def test_preset_that_is_none_is_refused(package, text, message):
+def test_invalid_preset_is_rejected(package, text, message):
   write(package.parent / "experiments", "broken.py", text)
   with pytest.raises(ConfigError, match="'broken'") as error:
     files.load_preset("broken")
   assert message in str(error.value)
 
 
-def test_scene_that_does_not_exist_names_those_that_do(package):
+def test_unknown_scene_lists_the_known_ones(package):
   write(package.parent / "mjcf", "kitchen.xml", "")
   assert files.mjcf_path("kitchen") == package.parent / "mjcf" / "kitchen.xml"
   with pytest.raises(ConfigError, match="'cellar'; choose from kitchen"):

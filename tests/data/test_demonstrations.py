@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
-import tiny
 
+from apnpql_jax import testing
 from apnpql_jax.cli import main
 from apnpql_jax.data import demonstrations, real_arm
 from apnpql_jax.data.demonstrations import Demonstrations
@@ -23,8 +23,8 @@ from apnpql_jax.sim.physics import START_TIME, Physics, PhysicsState
 from apnpql_jax.training import expert
 from apnpql_jax.training.rollout import expert_policy, make_player
 
-ENV = dataclasses.replace(tiny.CONFIG.env, time_limit_s=0.9)
-CONFIG = dataclasses.replace(tiny.CONFIG, env=ENV)
+ENV = dataclasses.replace(testing.TINY.env, time_limit_s=0.9)
+CONFIG = dataclasses.replace(testing.TINY, env=ENV)
 EPISODES, STEPS = 6, 6
 FUZZ = settings(
   max_examples=150,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax
 import numpy as np
 import pytest
-import tiny
 
+from apnpql_jax import testing
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.envs.cameras import make_cameras, shadows_of_the_hand
 from apnpql_jax.render import CameraSpec, Geoms, Lighting, render
@@ -26,7 +26,7 @@ def test_all_of_the_hand_throws_a_shadow(name):
 
 def test_the_shadow_is_seen_on_the_table_and_on_flat_marks_alone(task, resets):
   scene = task.scene
-  poses = jax.jit(make_kinematics(scene), compiler_options=tiny.FAST_COMPILE)(resets)
+  poses = jax.jit(make_kinematics(scene), compiler_options=testing.FAST_COMPILE)(resets)
   plain, shaded = (
     np.asarray(make_cameras(EnvConfig(shadows=shadows), scene)[0](poses), np.int32)
     for shadows in (False, True)

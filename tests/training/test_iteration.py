@@ -15,9 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import tiny
 
-from apnpql_jax import errors
+from apnpql_jax import errors, testing
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.agents.table_one import ALGORITHMS
 from apnpql_jax.cli import main
@@ -32,7 +31,7 @@ from apnpql_jax.training.expert import collect_expert, empty_expert
 from apnpql_jax.training.iteration import make_iteration, make_sample
 from apnpql_jax.training.state import TrainState, initial_state
 
-WORLDS, LENGTH = tiny.CONFIG.env.worlds, tiny.CONFIG.rollout_length
+WORLDS, LENGTH = testing.TINY.env.worlds, testing.TINY.rollout_length
 
 
 class Built(NamedTuple):
@@ -59,11 +58,11 @@ def _variants() -> list[Any]:
 def built(request) -> Built:
   algorithm, backend, obs, instants = request.param
   agent = dataclasses.replace(
-    tiny.CONFIG.agent, algorithm=algorithm, lstm_instants=instants
+    testing.TINY.agent, algorithm=algorithm, lstm_instants=instants
   )
   config = dataclasses.replace(
-    tiny.CONFIG,
-    env=dataclasses.replace(tiny.CONFIG.env, backend=backend, obs=obs),
+    testing.TINY,
+    env=dataclasses.replace(testing.TINY.env, backend=backend, obs=obs),
     agent=agent,
     max_skipped_updates=2,
   )
@@ -71,7 +70,7 @@ def built(request) -> Built:
   state = initial_state(config, env, agent, collect_expert)
   assert all(x.committed for x in jax.tree.leaves(state))
   jitted: Any = make_iteration(config, env, agent)
-  iteration = jitted.lower(state).compile(compiler_options=tiny.FAST_COMPILE)
+  iteration = jitted.lower(state).compile(compiler_options=testing.FAST_COMPILE)
   for _ in range(3):
     state, metrics = iteration(state)
   assert metrics["faults/worlds"] == metrics["faults/updates"] == 0

@@ -25,9 +25,8 @@ import jax.numpy as jnp
 import messages
 import numpy as np
 import pytest
-import tiny
 
-from apnpql_jax import devices
+from apnpql_jax import devices, testing
 from apnpql_jax.agents.learner import LearnerState, make_agent
 from apnpql_jax.cli import main
 from apnpql_jax.config.checks import validate
@@ -56,8 +55,8 @@ PATIENCE_S = 600
 
 @pytest.mark.parametrize("backend", SLOW_MJX)
 def test_four_devices_learn_what_one_learns(backend):
-  flags = f"{tiny.XLA_FLAGS} --xla_force_host_platform_device_count={DEVICES}"
-  path = os.pathsep.join(map(str, (tiny.ROOT, *sys.path, Path(__file__).parent)))
+  flags = f"{testing.XLA_FLAGS} --xla_force_host_platform_device_count={DEVICES}"
+  path = os.pathsep.join(map(str, (testing.ROOT, *sys.path, Path(__file__).parent)))
   done = subprocess.run(
     [sys.executable, "-c", f"import test_sharding as t; t.tell({backend!r})"],
     env=os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": path},
@@ -80,9 +79,9 @@ def test_four_devices_learn_what_one_learns(backend):
 
 def tell(backend: str) -> None:
   """Prints what becomes of a run on one device and on several, as JSON."""
-  env = dataclasses.replace(tiny.CONFIG.env, backend=backend, worlds=2 * DEVICES)
-  replay = dataclasses.replace(tiny.CONFIG.replay, capacity=LENGTH * env.worlds)
-  config = dataclasses.replace(tiny.CONFIG, env=env, replay=replay)
+  env = dataclasses.replace(testing.TINY.env, backend=backend, worlds=2 * DEVICES)
+  replay = dataclasses.replace(testing.TINY.replay, capacity=LENGTH * env.worlds)
+  config = dataclasses.replace(testing.TINY, env=env, replay=replay)
   told: dict[str, Any] = {"loss": []}
   several = make_env(config.env, devices.make_mesh(DEVICES))
   alone, agent, ends = several.on_one_device(), make_agent(config.agent), []
@@ -145,10 +144,12 @@ def test_two_processes_learn_what_one_learns_and_stop_together(tmp_path):
       address = f"127.0.0.1:{free.getsockname()[1]}"
     shared = ("--coordinator", address, "--processes", "2", "--process")
     common = ("--keep-checkpoints", "1000", *args)
-    return [tiny.start(run, *common, *shared, str(i), said=said[i]) for i in range(2)]
+    return [
+      testing.start(run, *common, *shared, str(i), said=said[i]) for i in range(2)
+    ]
 
   pair = start("--total-steps", "32")
-  alone = tiny.start(single, "--total-steps", "64", said=said[2])
+  alone = testing.start(single, "--total-steps", "64", said=said[2])
   for process, log in zip([*pair, alone], said, strict=True):
     assert process.wait(PATIENCE_S) == 0, log.read_text()[-4000:]
   # The first process tells of it, the second one has nothing to say.
@@ -163,7 +164,7 @@ def test_two_processes_learn_what_one_learns_and_stop_together(tmp_path):
   pair[1].send_signal(signal.SIGTERM)
   for process, log in zip(pair, said, strict=False):
     assert process.wait(PATIENCE_S) == 128 + signal.SIGTERM, log.read_text()[-4000:]
-  rows = [row["step"] for row in tiny.rows(run) if "loss/q" in row]
+  rows = [row["step"] for row in testing.rows(run) if "loss/q" in row]
   assert rows == list(range(8, rows[-1] + 8, 8))
   assert checkpoint_reader.latest_step(run) == rows[-1]
 

@@ -1,6 +1,7 @@
-"""The smallest runs that are still real, for the tests of reliability and the soak.
+"""Tiny runs and random batches, for tests and benchmarks.
 
-Their processes compile without optimisation: nobody waits for such a run to be fast.
+The runs are as small as a run can be and still be real. Their processes compile without
+optimization, because nobody waits for such a run to be fast.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import sys
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
@@ -21,6 +23,7 @@ from apnpql_jax.data import demonstrations
 from apnpql_jax.primitives.reset_bank import load_bank
 from apnpql_jax.runs import metrics
 from apnpql_jax.tasks import make_task
+from apnpql_jax.types import Observation, Slot, TimeStep, Transition
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -31,7 +34,7 @@ FAST_COMPILE = {
 XLA_FLAGS = " ".join(f"--{name}={value}" for name, value in FAST_COMPILE.items())
 """The same for the environment of a process."""
 
-CONFIG = TrainConfig(
+TINY = TrainConfig(
   env=EnvConfig(worlds=4, bank_rows=256, obs="state", backend="native"),
   agent=AgentConfig(
     n_step=2,
@@ -51,10 +54,10 @@ CONFIG = TrainConfig(
   checkpoint_every=16,
   video=False,
 )
-STEPS = CONFIG.env.worlds * CONFIG.rollout_length
+STEPS = TINY.env.worlds * TINY.rollout_length
 """Environment steps per iteration."""
 
-PRESET_ARGS = (  # The same on the command line, on top of push_plate's preset.
+TINY_ARGS = (
   "--env.worlds 4 --env.bank-rows 256 --obs state --backend native --agent.n-step 2 "
   "--agent.hidden 16 16 --agent.feature-dim 16 --agent.target-samples 4 "
   "--agent.policy-samples 4 --agent.m-step-delay 0 --replay.capacity 64 "
@@ -62,6 +65,7 @@ PRESET_ARGS = (  # The same on the command line, on top of push_plate's preset.
   "--rollout-length 2 --updates-per-iteration 2 --eval-every 1000000 "
   "--eval-episodes 4 --checkpoint-every 16 --no-video"
 ).split()
+"""Options that turn the preset push_plate into ``TINY``."""
 
 
 def start(
@@ -76,7 +80,7 @@ def start(
   if (run_dir / "config.json").exists():
     command += ["--resume", str(run_dir)]
   else:
-    command += ["push_plate", "--run", str(run_dir), *PRESET_ARGS]
+    command += ["push_plate", "--run", str(run_dir), *TINY_ARGS]
   env = os.environ | {"XLA_FLAGS": xla_flags, "PYTHONPATH": str(ROOT)}
   env |= {"JAX_LOG_COMPILES": "1"} if log_compiles else {}
   with said.open("ab") as file:
@@ -87,7 +91,7 @@ def start(
 
 def write_demonstrations(path: Path) -> None:
   """A file of four episodes of four instants, in which the arm holds still."""
-  env = CONFIG.env
+  env = TINY.env
   task = make_task(env.task)
   bank, _ = load_bank(task, env.bank_rows)
   rows = np.arange(16) // 4
@@ -125,3 +129,74 @@ def saved_arrays(run_dir: Path, step: int) -> dict[str, np.ndarray]:
 def saved_bytes(run_dir: Path, step: int) -> dict[str, bytes]:
   """The bits of ``saved_arrays``."""
   return {name: x.tobytes() for name, x in saved_arrays(run_dir, step).items()}
+
+
+SMALL = AgentConfig(
+  hidden=(16, 16),
+  feature_dim=16,
+  num_atoms=11,
+  target_samples=8,
+  policy_samples=8,
+  patch_channels=4,
+  conv_channels=4,
+  n_step=2,
+)
+"""Compiles in a few seconds, whichever row of Table I it is given."""
+
+
+def random_batch(
+  seed: int,
+  batch: int = 16,
+  *,
+  pixels: bool = False,
+  windows: int = 0,
+  instants: int = 0,
+) -> Transition:
+  """Transitions with noise for everything; if asked with images, with a window of N
+  instants, and with observations of L instants each."""
+  rng = np.random.default_rng(seed)
+
+  def normal(*shape: int) -> jax.Array:
+    return jnp.asarray(rng.normal(size=shape), jnp.float32)
+
+  def flags(*shape: int) -> jax.Array:
+    return jnp.asarray(rng.random(shape) < 0.3)
+
+  def image(*shape: int) -> jax.Array | None:
+    return jnp.asarray(rng.integers(0, 256, shape), jnp.uint8) if pixels else None
+
+  def observation(*shape: int) -> Observation:
+    shape += (instants,) * bool(instants)
+    return Observation(
+      robot=normal(*shape, 21),
+      tool=0.3 * normal(*shape, 3),
+      global_image=image(*shape, 72, 96, 3),
+      wrist_image=image(*shape, 36, 64, 3),
+      objects=0.3 * normal(*shape, 9),
+    )
+
+  def action(*shape: int) -> jax.Array:
+    gripper = jnp.asarray(rng.integers(0, 2, (*shape, 1)), jnp.float32)
+    return jnp.concatenate([jnp.tanh(normal(*shape, 6)), gripper], axis=-1)
+
+  def slots(*shape: int) -> Slot:
+    timestep = TimeStep(
+      observation=observation(*shape),
+      reward=normal(*shape),
+      terminated=flags(*shape),
+      truncated=flags(*shape),
+      primitives=action(*shape, 3),
+    )
+    return Slot(timestep, action(*shape), log_prob=normal(*shape))
+
+  success = flags(batch).astype(jnp.float32)
+  return Transition(
+    observation_tm1=observation(batch),
+    action_tm1=action(batch),
+    reward_t=success,
+    discount_t=0.97 * (1.0 - success),
+    observation_t=observation(batch),
+    primitives_tm1=action(batch, 3),
+    weight=jnp.ones(batch),
+    window=slots(batch, windows) if windows else None,
+  )

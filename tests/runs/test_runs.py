@@ -46,7 +46,7 @@ def test_a_run_made_before_a_setting_came_is_read_and_that_is_said(tmp_path):
   said: list[str] = []
   assert run_folder.load_run_config(run, said.append) == config
   assert said == [
-    f"{run}/config.json is older than some settings, which are as before: "
+    f"{run}/config.json is older than some settings, which keep their old behavior: "
     "agent.residual_blocks 0"
   ]
   # It is resumed as it was, and only so.
