@@ -43,9 +43,9 @@ def on_files(files: Any, config: Any) -> Any:
   for site, source in _outside().items():
     files.append(File.generated(config, site, abs_src_path=str(ROOT / source)))
   for site, modules in _reference().items():
-    title = "apnpql_jax" if site.stem == "package" else site.stem
-    text = "\n\n".join([f"# {title}", *(f"::: {module}" for module in modules)])
-    files.append(File.generated(config, str(site), content=text))
+    title = f"# {Path(site).stem}"
+    text = "\n\n".join([title, *(f"::: {module}" for module in modules)])
+    files.append(File.generated(config, site, content=text))
   return files
 
 
@@ -76,14 +76,14 @@ def _outside() -> dict[str, str]:
   return {site: source for source, site in MOVED.items()} | same
 
 
-def _reference() -> dict[Path, list[str]]:
+def _reference() -> dict[str, list[str]]:
   """Reference page -> modules on it: one page per package."""
-  pages: dict[Path, list[str]] = {}
+  pages: dict[str, list[str]] = {}
   for path in sorted(PACKAGE.rglob("*.py")):
     if path.stem.startswith("__"):
       continue
     parts = path.relative_to(ROOT).with_suffix("").parts
-    page = Path("reference", "-".join(parts[1:-1]) or "package").with_suffix(".md")
+    page = f"reference/{'.'.join(parts[1:-1]) or PACKAGE.name}.md"
     pages.setdefault(page, []).append(".".join(parts))
   return pages
 
@@ -91,8 +91,8 @@ def _reference() -> dict[Path, list[str]]:
 def _pages() -> list[str]:
   """Paths in the site of all pages, sorted, an index before the others."""
   docs = (str(path.relative_to(ROOT / "docs")) for path in ROOT.glob("docs/**/*.md"))
-  pages = {*docs, *_outside(), *map(str, _reference())}
-  return sorted(pages, key=lambda page: (not page.endswith("index.md"), page))
+  pages = {*docs, *_outside(), *_reference()}
+  return sorted(pages, key=lambda page: (not page.endswith("index.md"), page[:-3]))
 
 
 def _expanded(entry: Any, pages: list[str]) -> Any:
