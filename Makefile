@@ -32,7 +32,7 @@ lint: $(VENV)/.dev
 	$(BIN)/codespell
 
 docs: $(VENV)/.docs
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 cuda: $(VENV)/.runtime
 	$(PIP) install --no-build-isolation --constraint requirements.lock -e '.[cuda]'

@@ -1,4 +1,7 @@
-"""MkDocs hooks: pages from outside ``docs/``, reference pages, links between them."""
+"""MkDocs hooks: pages from outside ``docs/``, reference pages, and links between them.
+
+Links in the documents lead to files of the repository, so that they work there too.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,7 @@ KEPT = (
 )
 """Files outside ``docs/`` that have the same path in the site."""
 
-LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s:#]+)(#[^)\s]*)?\)")
+LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s:#]+)(?:#([^)\s]*))?\)")
 
 
 def on_config(config: Any) -> Any:
@@ -56,17 +59,25 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
   source = Path(_outside().get(here, f"docs/{here}"))
 
   def link(match: re.Match[str]) -> str:
-    image, text, target, anchor = match.groups()
+    image, text, target, name = match.groups()
     path = os.path.normpath(source.parent / target)
     if not (ROOT / path).exists():
       return match[0]  # MkDocs reports it.
-    site = MOVED.get(path, path.removeprefix("docs/"))
+    site, anchor = _target(path, name or "")
     if files.get_file_from_path(site) is None:
       return text  # In the repository only.
     relative = os.path.relpath(site, os.path.dirname(here) or ".")
-    return f"{image}[{text}]({relative}{anchor or ''})"
+    return f"{image}[{text}]({relative}{anchor and '#' + anchor})"
 
   return LINK.sub(link, markdown)
+
+
+def _target(path: str, name: str) -> tuple[str, str]:
+  """Page and anchor that stand for ``name`` in a file of the repository."""
+  if not path.startswith(f"{PACKAGE.name}/"):
+    return MOVED.get(path, path.removeprefix("docs/")), name
+  module = path.removesuffix(".py").replace("/", ".")
+  return _page_of(module), f"{module}.{name}" if name else module
 
 
 def _outside() -> dict[str, str]:
@@ -83,9 +94,15 @@ def _reference() -> dict[str, list[str]]:
     if path.stem.startswith("__"):
       continue
     parts = path.relative_to(ROOT).with_suffix("").parts
-    page = f"reference/{'.'.join(parts[1:-1]) or PACKAGE.name}.md"
-    pages.setdefault(page, []).append(".".join(parts))
+    module = ".".join(parts)
+    pages.setdefault(_page_of(module), []).append(module)
   return pages
+
+
+def _page_of(module: str) -> str:
+  """Reference page of a module: that of its package."""
+  package = module.split(".")[1:-1] or [PACKAGE.name]
+  return f"reference/{'.'.join(package)}.md"
 
 
 def _pages() -> list[str]:
