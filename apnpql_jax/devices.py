@@ -1,9 +1,9 @@
 """Several devices and processes: worlds and batches are split, all else is replicated.
 
 The iteration stays one program for all worlds, which XLA partitions along its arrays:
-random numbers equal those of one device, and results do within rounding. Module
-``placement`` says which part of the state is split. Processes on several hosts share
-one run: each computes for its own devices, and the first one writes and prints.
+random numbers equal those of one device, and results do within rounding. ``placement``
+defines which parts of the state are split. Processes on several hosts share one run:
+each computes for its own devices, and the first one writes and prints.
 """
 
 from __future__ import annotations

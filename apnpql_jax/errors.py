@@ -16,7 +16,7 @@ class UserError(Exception):
 
 
 class ConfigError(UserError, ValueError):
-  """An invalid setting; the message says what to write instead."""
+  """An invalid setting; the message names a valid one."""
 
 
 class FileError(UserError):
@@ -24,7 +24,7 @@ class FileError(UserError):
 
 
 class RunStopped(Exception):
-  """An orderly stop of a run before its last step; the one-line message says why."""
+  """An orderly stop of a run before its last step, with a one-line reason."""
 
   def __init__(self, message: str, code: int):
     """Stores the exit code: ``FAILED``, or ``INTERRUPTED`` plus a signal number."""

@@ -9,33 +9,35 @@ from typing import Any
 
 from flax import linen as nn
 import jax.numpy as jnp
+from jaxtyping import Float, UInt8
 import numpy as np
 
+from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.types import ARM_DOF, Array, Observation
 
 PATCH = 4
-"""Side of the pixel patches that the first convolution sees."""
+"""Side of the pixel patches that the first convolution reads."""
 
 _STEP_SCALE = 7.0
-"""Brings a joint's change per control period (0.15 rad at most) to order one."""
+"""Scales a joint's change per control period (0.15 rad at most) to order one."""
 
 _POSITION_SCALE = 5.0
-"""Brings positions within reach of the arm (m) to order one, centimeters to 0.05."""
+"""Scales positions within reach of the arm (m) to order one, centimeters to 0.05."""
 
 _NEAR = 0.05, 0.2
-"""m; distances from the tool within which points are seen in detail."""
+"""Distances from the tool (m) within which points are resolved in detail."""
 
 _SHARPNESS = 4.0
-"""Scales the scores of keypoints: each looks at a part of the image from the start."""
+"""Scales the scores of keypoints, so that each is local before training."""
 
 
 class PixelEncoder(nn.Module):
-  """Two convolution layers for one camera, and residual blocks if there shall be any.
+  """Two convolution layers for one camera, optionally with residual blocks.
 
   A 4x4 convolution with stride 4, then a 3x3 one with stride 2 (or 2x2 without
-  overlap), both written as matrix products: XLA:CPU runs a convolution inside a scan,
-  where updates live, up to ten times slower. Images are padded with black to whole
-  cells of 8x8 pixels.
+  overlap), both written as matrix products: inside a scan, where updates run, XLA:CPU
+  runs a convolution up to ten times slower. Images are padded with black to whole cells
+  of 8x8 pixels.
   """
 
   channels: Sequence[int]
@@ -43,20 +45,21 @@ class PixelEncoder(nn.Module):
   residual_blocks: int = 0
 
   @nn.compact
-  def __call__(self, image: Array) -> tuple[Array, Array]:
-    """u8[*b, H, W, 3] -> map f32[*b, n], after relu and flattened, not pooled: where a
-    thing is must survive; keypoints f32[*b, m] of both layers."""
+  def __call__(
+    self, image: UInt8[Array, "*b H W 3"]
+  ) -> tuple[Float[Array, "*b n"], Float[Array, "*b m"]]:
+    """Returns the map and the keypoints of both layers.
+
+    The map is flattened instead of pooled to keep the positions of objects.
+    """
     first, second = self.channels
-    # Rearranged while still bytes, a quarter of the traffic, and by cells of four
-    # patches, so that the second layer finds its windows without strided copies.
+    # Rearrange bytes, a quarter of the memory traffic, into cells of four patches, so
+    # that the second layer finds its windows without strided copies.
     cells = space_to_depth(space_to_depth(image, PATCH), 2)
     cells = cells.reshape(*cells.shape[:-1], 4, -1).astype(jnp.float32) / 255.0
     patches = nn.Dense(first, name="patches")(cells)
     cells = nn.relu(patches)
-    if self.overlap:
-      x = windows(cells)
-    else:
-      x = cells.reshape(*cells.shape[:-2], -1)
+    x = windows(cells) if self.overlap else cells.reshape(*cells.shape[:-2], -1)
     x = nn.Dense(second, name="conv")(x)
     for i in range(self.residual_blocks):
       x = ResidualBlock(second, name=f"block_{i}")(x)
@@ -65,13 +68,16 @@ class PixelEncoder(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-  """f32[*b, H, W, C] -> the same plus two 3x3 convolutions, relu before each (He et
-  al. 2016b). Starts as the identity."""
+  """Two 3x3 convolutions around a skip connection (He et al. 2016b).
+
+  A relu precedes each convolution. The block starts as the identity.
+  """
 
   channels: int
 
   @nn.compact
-  def __call__(self, x: Array) -> Array:
+  def __call__(self, x: Float[Array, "*b H W C"]) -> Float[Array, "*b H W C"]:
+    """Adds the output of the convolutions to ``x``."""
     y = nn.Conv(self.channels, (3, 3), name="first")(nn.relu(x))
     y = nn.Conv(
       self.channels, (3, 3), name="second", kernel_init=nn.initializers.zeros
@@ -82,117 +88,109 @@ class ResidualBlock(nn.Module):
 class Encoder(nn.Module):
   """Feature extractor f^fe: observation -> phi (paper Sec. IV-B).
 
-  Keypoints of a camera are positions and go with those of the robot. A map has its own
+  Keypoints of a camera are positions and join those of the robot. Each map has its own
   projection, and the projections are summed, so that thousands of pixel features do not
-  drown a few dozen of the robot. The layer norm gives phi a fixed scale: the heads that
-  read phi without training it (prior, alpha) then follow the encoder instead of chasing
-  its growing activations.
+  outweigh a few dozen of the robot. The layer norm gives phi a fixed scale: heads that
+  read phi without training it (prior, alpha) need not follow growing activations.
 
-  An LSTM, if there is one, reads what would be phi of the last instants of an episode.
-  It begins with an empty memory in acting and learning alike. Its last output is phi,
-  which lies within -1 and 1.
+  The optional LSTM reads these features of the last L instants of an episode. It starts
+  with an empty memory in acting and learning alike. Its last output is phi, which lies
+  within -1 and 1.
   """
 
-  feature_dim: int
-  channels: Sequence[int]
-  overlap: bool
-  residual_blocks: int
-  global_features: str
-  wrist_features: str
-  lstm_instants: int
+  config: AgentConfig
 
   @nn.compact
-  def __call__(self, observation: Observation) -> Array:
-    """Observation with batch *b -> f32[*b, feature_dim].
-
-    With an LSTM that reads L instants the observation has [*b, L, ...], oldest first.
+  def __call__(self, observation: Observation) -> Float[Array, "*b feature_dim"]:
+    """Computes phi; with an LSTM, from observations [*b, L, ...], oldest first.
 
     Raises:
-      ValueError: it has another number of instants than the LSTM reads.
+      ValueError: for another number of instants than the LSTM reads.
     """
-    body = functools.partial(nn.Dense, self.feature_dim)
+    config = self.config
+    body = functools.partial(nn.Dense, config.feature_dim)
     state = [robot_inputs(observation.robot)]
     for positions in (observation.tool, observation.objects):
       if positions is not None:
         state.append(_POSITION_SCALE * positions)
     if observation.objects is not None and observation.tool is not None:
       state.append(seen_from(observation.tool, observation.objects))
-    maps = []
-    kinds = {"global_image": self.global_features, "wrist_image": self.wrist_features}
-    for name, kind in kinds.items():
-      image = getattr(observation, name)
+    # Encode the images: keypoints join the state, maps are projected.
+    maps, channels = [], (config.patch_channels, config.conv_channels)
+    for name, image, kind in (
+      ("global_image", observation.global_image, config.global_features),
+      ("wrist_image", observation.wrist_image, config.wrist_features),
+    ):
       if image is not None:
-        look = PixelEncoder(
-          self.channels, self.overlap, self.residual_blocks, name=name
+        camera = PixelEncoder(
+          channels, config.conv_overlap, config.residual_blocks, name=name
         )
-        pixels, points = look(image)
+        pixels, points = camera(image)
         if kind != "map":
           state.append(points)
         if kind != "keypoints":
           maps.append(body(name=f"from_{name}", use_bias=False)(pixels))
+    # Sum the projections and normalize.
     state = nn.relu(body(name="state")(jnp.concatenate(state, axis=-1)))
     x = sum(maps, body(name="from_state")(state))
     x = nn.relu(nn.LayerNorm(name="norm")(x))
-    if not self.lstm_instants:
+    instants = config.lstm_instants
+    if not instants:
       return x
-    if x.shape[-2:-1] != (self.lstm_instants,):
-      raise ValueError(f"features {x.shape} are not of {self.lstm_instants} instants")
-    cell = nn.OptimizedLSTMCell(self.feature_dim, name="lstm")
-    outputs: Any = nn.RNN(cell, unroll=self.lstm_instants)(x)
+    if x.shape[-2:-1] != (instants,):
+      raise ValueError(f"features {x.shape} do not have {instants} instants")
+    cell = nn.OptimizedLSTMCell(config.feature_dim, name="lstm")
+    outputs: Any = nn.RNN(cell, unroll=instants)(x)
     return outputs[..., -1, :]
 
 
-def keypoints(scores: Array) -> Array:
-  """Where in the image each channel scores highest (spatial soft-argmax).
+def keypoints(scores: Float[Array, "*b R S P C"]) -> Float[Array, "*b 2*C"]:
+  """Locates the highest score of each channel (spatial soft-argmax).
 
-  The expected position under a softmax over the map (Levine et al. 2016): a position
-  seen in one place of the image is understood in all others.
+  This is the expected position under a softmax over the map (Levine et al. 2016). What
+  the layers after it learn in one part of the image therefore carries over to others.
 
   Args:
-    scores: f32[*b, R, S, P, C], cells of one position, or of the four 00, 01, 10, 11.
+    scores: scores by cells of one position, or of the four 00, 01, 10, 11.
 
   Returns:
-    f32[*b, 2 C] within [-1, 1], the row and the column of each channel.
+    Row and column of each channel within [-1, 1].
   """
   *batch, rows, columns, parts, channels = scores.shape
+  # Find the center of every position, as (row, column) within [-1, 1].
   side = math.isqrt(parts)
   down, across = (np.stack(np.divmod(np.arange(parts), side)) + 0.5) / side
   row = 2.0 * (np.arange(rows)[:, None, None] + down) / rows - 1.0
   column = 2.0 * (np.arange(columns)[:, None] + across) / columns - 1.0
   where = np.stack(np.broadcast_arrays(row, column), axis=-1).reshape(-1, 2)
+  # Average the centers under the softmax of each channel.
   flat = _SHARPNESS * scores.reshape(*batch, rows * columns * parts, channels)
   share = nn.softmax(flat, axis=-2)
   points = jnp.einsum("...pc,pd->...cd", share, where.astype(np.float32))
   return points.reshape(*batch, 2 * channels)
 
 
-def seen_from(tool: Array, points: Array) -> Array:
-  """Where points are from the tool, the more exactly the nearer they are.
+def seen_from(
+  tool: Float[Array, "*b 3"], points: Float[Array, "*b 3*k"]
+) -> Float[Array, "*b 6*k"]:
+  """Returns offsets of points from the tool (m), squashed to [-1, 1] at two scales.
 
-  A millimeter decides whether a hand can close, and is lost among the half meter of a
-  table.
-
-  Args:
-    tool: f32[*b, 3], m.
-    points: f32[*b, 3 k], m.
-
-  Returns:
-    f32[*b, 6 k] within [-1, 1].
+  Resolution is highest near the tool: a millimeter decides whether the hand can close,
+  and is lost in positions that span half a meter of table.
   """
   away = points.reshape(*points.shape[:-1], -1, 3) - tool[..., None, :]
   squashed = jnp.stack([jnp.tanh(away / near) for near in _NEAR], axis=-1)
   return squashed.reshape(*points.shape[:-1], -1)
 
 
-def robot_inputs(robot: Array) -> Array:
-  """Network inputs of order one from the stacked robot state.
+def robot_inputs(robot: Float[Array, "*b 21"]) -> Float[Array, "*b 33"]:
+  """Converts the last three robot states (rad) to network inputs of order one.
 
   Args:
-    robot: f32[*b, 3 * 7], the last three (6 joint angles, gripper angle), newest
-      last, in rad.
+    robot: three times 6 joint angles and the gripper's, newest last.
 
   Returns:
-    f32[*b, 33]: newest state, sine and cosine of its joints, the last two changes.
+    Newest state, sine and cosine of its joints, and the last two changes.
   """
   stack = robot.reshape(*robot.shape[:-1], 3, ARM_DOF + 1)
   newest = stack[..., -1, :]
@@ -217,15 +215,15 @@ def space_to_depth(image: Array, size: int) -> Array:
   return jnp.swapaxes(image, -4, -3).reshape(*batch, rows, columns, -1)
 
 
-def windows(cells: Array) -> Array:
-  """The 3x3 windows, with stride 2 and zero padding, of a map stored by 2x2 cells.
+def windows(cells: Float[Array, "*b R S 4 C"]) -> Float[Array, "*b R S 9*C"]:
+  """Extracts 3x3 windows, stride 2 with zero padding, from a map stored by 2x2 cells.
 
   Args:
-    cells: f32[*b, R, S, 4, C], the positions 00, 01, 10, 11 of each cell.
+    cells: positions 00, 01, 10, 11 of each cell.
 
   Returns:
-    f32[*b, R, S, 9 C]: the whole cell, then the touching column of the right
-    neighbor, the touching row of the one below, and the corner of the diagonal one.
+    The whole cell, then the touching column of its right neighbor, the touching row of
+    the neighbor below, and the touching corner of the diagonal neighbor.
   """
   own = cells.reshape(*cells.shape[:-2], -1)
   border = [(0, 0)] * (cells.ndim - 4) + [(0, 1), (0, 1), (0, 0), (0, 0)]

@@ -10,21 +10,17 @@ from typing import Any
 from flax import linen as nn
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float, PRNGKeyArray
 
 from apnpql_jax.agents.mixture_head import mixture_from_outputs
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.dists.gmm import GripperGMM
-from apnpql_jax.types import (
-  ACTION_DIM,
-  NUM_PRIMITIVES,
-  Array,
-  Observation,
-)
+from apnpql_jax.types import ACTION_DIM, NUM_PRIMITIVES, Array, Observation
 
 Params = dict[str, Any]
 
 GROUPS = ("encoder", "ap", "bp", "z", "alpha", "policy")
-"""Top level of the parameter tree; the groups an algorithm lacks are left out."""
+"""Top level of the parameter tree; groups that an algorithm lacks are absent."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,13 +28,13 @@ class Networks:
   """The modules, one per group."""
 
   modules: dict[str, nn.Module]
-  value: Callable[[Array], Array]
-  """Outputs of the value head f32[*b, n] -> Q f32[*b]."""
+  value: Callable[[Float[Array, "*b n"]], Float[Array, "*b"]]
+  """Converts outputs of the value head to Q."""
 
   config: AgentConfig
 
-  def init(self, key: Array, observation: Observation) -> Params:
-    """Fresh parameters, one entry per module, from an example batch."""
+  def init(self, key: PRNGKeyArray, observation: Observation) -> Params:
+    """Initializes parameters, one entry per module, from an example batch."""
     keys = dict(zip(GROUPS, jax.random.split(key, len(GROUPS)), strict=True))
     batch = observation.robot.shape[:-1]
     phi = jnp.zeros((*batch, self.config.feature_dim))
@@ -48,12 +44,12 @@ class Networks:
     return {k: m.init(keys[k], *inputs[k])["params"] for k, m in self.modules.items()}
 
   def at(self, params: Params, observation: Observation) -> Heads:
-    """The heads at a batch of states; the encoder runs here, and only here."""
+    """Returns the heads at a batch of states; only this method runs the encoder."""
     phi = self.apply("encoder", params, observation)
     return Heads(self, params, phi)
 
   def apply(self, group: str, params: Params, *inputs: Any) -> Any:
-    """What the module of ``group`` makes of ``inputs``."""
+    """Applies the module of ``group`` to ``inputs``."""
     return self.modules[group].apply({"params": params[group]}, *inputs)
 
 
@@ -61,39 +57,39 @@ class Networks:
 class Heads:
   """Networks, parameters and features bound together: all predictions at ``*b`` states.
 
-  Which prediction trains what is settled here: prior, policy and alpha read phi
-  without training it, for the loss of the E-step names neither (paper Eq. 10).
+  Each prediction here determines which parameters it trains. Prior, policy and alpha
+  read phi without training it, because the E-step's loss has neither (paper Eq. 10).
   """
 
   networks: Networks
   params: Params
-  phi: Array  # f32[*b, feature_dim]
+  phi: Float[Array, "*b feature_dim"]
 
   @property
   def config(self) -> AgentConfig:
-    """The settings of the networks."""
+    """Settings of the networks."""
     return self.networks.config
 
   def frozen(self) -> Heads:
-    """The same predictions; no gradient reaches the parameters."""
+    """Returns heads with equal predictions and without gradients to parameters."""
     params, phi = jax.lax.stop_gradient((self.params, self.phi))
     return dataclasses.replace(self, params=params, phi=phi)
 
-  def primitives(self) -> Array:
-    """Predicted action primitives theta^ap, f32[*b, 3, 7]: joint velocities in rad/s,
-    unbounded, and the logit of closing the gripper.
+  def primitives(self) -> Float[Array, "*b 3 7"]:
+    """Predicts the action primitives theta^ap.
 
-    The labels lie within [-1, 1], often on the border, where a squashed output
+    These are joint velocities in rad/s, unbounded, and the logit of closing the
+    gripper. The labels lie within [-1, 1], often at the bounds, where a squashed output
     would lose its gradient.
     """
     flat = self._apply("ap", self.phi)
     return flat.reshape(*self.phi.shape[:-1], NUM_PRIMITIVES, ACTION_DIM)
 
   def prior(self) -> GripperGMM:
-    """Behavior prior b_theta; its gradient reaches the bp group alone.
+    """Returns the behavior prior b_theta; trains only the bp group.
 
-    Means are the predicted primitives within the action box (paper Sec. IV-A). The
-    M-step trains what is left of theta and must move neither them nor phi.
+    Means are the predicted primitives, clipped to the action box (paper Sec. IV-A). The
+    M-step trains the rest of theta and must move neither the means nor phi.
     """
     learned_mean = self.config.prior_mean == "learned"
     return mixture_from_outputs(
@@ -108,9 +104,9 @@ class Heads:
     )
 
   def policy(self) -> GripperGMM:
-    """Parametric policy pi_psi, of one component; trains the policy group alone.
+    """Returns the parametric policy pi_psi, one component; trains only its group.
 
-    Like the prior it is not squashed: draws are clipped where Q and the arm see them.
+    Like the prior it is not squashed: Q and the arm receive clipped draws.
     """
     return mixture_from_outputs(
       self._apply("policy", jax.lax.stop_gradient(self.phi)),
@@ -123,8 +119,8 @@ class Heads:
       diagonal=self.config.diagonal_covariance,
     )
 
-  def alpha(self) -> Array:
-    """Temperature of each state, f32[*b] > 0; trains its own head only."""
+  def alpha(self) -> Float[Array, "*b"]:
+    """Returns the temperature > 0 of each state; trains only its own head."""
     offset = math.log(math.expm1(self.config.initial_alpha))  # Inverse of softplus.
     if self.config.temperature == "fixed":
       raw = jnp.zeros(self.phi.shape[:-1])
@@ -132,12 +128,12 @@ class Heads:
       raw = self._apply("alpha", jax.lax.stop_gradient(self.phi))[..., 0]
     return jax.nn.softplus(raw + offset) + self.config.min_alpha
 
-  def z(self, actions: Array) -> Array:
-    """Outputs of the value head: f32[S, *b, 7] -> f32[S, *b, n]."""
+  def z(self, actions: Float[Array, " s *b 7"]) -> Float[Array, " s *b n"]:
+    """Returns the outputs of the value head."""
     return self._apply("z", self.phi, actions)
 
-  def q(self, actions: Array) -> Array:
-    """Expected return: f32[S, *b, 7] -> f32[S, *b]."""
+  def q(self, actions: Float[Array, " s *b 7"]) -> Float[Array, " s *b"]:
+    """Returns the expected return."""
     return self.networks.value(self.z(actions))
 
   def _apply(self, group: str, *inputs: Array) -> Any:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import dataclasses
+import functools
 from typing import Any
 
 from flax import struct
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float, Int, PRNGKeyArray
 import optax
 
 from apnpql_jax.agents import losses
@@ -25,13 +27,13 @@ from apnpql_jax.types import Array, Metrics, Observation, Transition
 
 
 class LearnerState(struct.PyTreeNode):
-  """All that the learner needs to go on."""
+  """Complete state of the learner."""
 
   params: Params  # one entry per group that the algorithm has
-  target_params: Params  # slow average of params, which also is what acts
-  nu: Array  # f32[] >= 0: multiplier of the entropy floor
+  target_params: Params  # moving average of params; these act
+  nu: Float[Array, ""]  # multiplier >= 0 of the entropy floor
   opt_state: Any  # of one Adam per learning rate
-  step: Array  # i32[]: updates done
+  step: Int[Array, ""]  # updates done
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,18 +43,20 @@ class Agent:
   networks: Networks
   evaluation: Evaluation
 
-  init: Callable[[Array, Observation], LearnerState]
+  init: Callable[[PRNGKeyArray, Observation], LearnerState]
   """(key, example observation with a batch axis) -> state before learning."""
 
-  act: Callable[[Params, Observation, Array, bool], tuple[Array, Metrics]]
+  act: Callable[[Params, Observation, PRNGKeyArray, bool], tuple[Array, Metrics]]
   """(params, observation [B], key, greedy) -> actions f32[B, 7], info f32[B] each.
 
-  The policy's candidates are drawn, and one is picked by its weights. If greedy (a
-  Python bool) it is the one of highest value, or the mean of a parametric policy. Info
-  has the action's log_prob, which Retrace needs, and for a look at a policy its q,
-  q_max and ess of the candidates, and alpha."""
+  Draws the policy's candidates and picks one by its weights. If greedy (a Python bool),
+  picks the one of highest value, or the mean of a parametric policy. Info has the
+  action's log_prob, which Retrace needs, and as diagnostics its q, the candidates'
+  q_max and ess, and alpha."""
 
-  update: Callable[[LearnerState, Transition, Array], tuple[LearnerState, Metrics]]
+  update: Callable[
+    [LearnerState, Transition, PRNGKeyArray], tuple[LearnerState, Metrics]
+  ]
   """(state, transitions [B], key) -> state after one update, metrics f32[]."""
 
 
@@ -60,8 +64,8 @@ def make_agent(config: AgentConfig) -> Agent:
   """Builds the agent that ``config`` describes.
 
   Raises:
-    ConfigError: unknown algorithm, or settings that cannot work, such as a KL limit
-      that the samples can never reach.
+    ConfigError: for an unknown algorithm, or for settings that cannot work, such as a
+      KL limit that the samples can never reach.
   """
   validate(TrainConfig(agent=config), algorithms=epsilon_bounds())
   algorithm = algorithm_of(config)
@@ -69,8 +73,9 @@ def make_agent(config: AgentConfig) -> Agent:
   evaluation = algorithm.policy_evaluation(config)
   networks = make_networks(config, groups, evaluation)
   optimizer = make_optimizer(config, groups)
+  loss = functools.partial(total_loss, networks, algorithm, evaluation)
 
-  def init(key: Array, observation: Observation) -> LearnerState:
+  def init(key: PRNGKeyArray, observation: Observation) -> LearnerState:
     params = networks.init(key, observation)
     nu = jnp.zeros(())
     return LearnerState(
@@ -82,12 +87,30 @@ def make_agent(config: AgentConfig) -> Agent:
     )
 
   def act(
-    params: Params, observation: Observation, key: Array, greedy: bool = False
+    params: Params, observation: Observation, key: PRNGKeyArray, greedy: bool = False
   ) -> tuple[Array, Metrics]:
-    return _act(networks, algorithm, params, observation, key, greedy=greedy)
+    # Draw candidates and pick one by its weight (paper Sec. III-B).
+    key_candidates, key_pick = jax.random.split(key)
+    heads = networks.at(params, observation)
+    prior = algorithm.regularizer(heads, heads)
+    candidates = algorithm.policy(
+      heads, prior, key_candidates, num_samples=config.policy_samples, greedy=greedy
+    )
+    q_values, weights = candidates.q_values, candidates.weights
+    chosen = boltzmann.pick(key_pick, weights)
+    actions = jnp.take_along_axis(candidates.actions, chosen[None, :, None], axis=0)
+    q = jnp.take_along_axis(q_values, chosen[None], axis=0)
+    info = {
+      "q": q[0],
+      "q_max": jnp.max(q_values, axis=0),
+      "alpha": heads.alpha(),
+      "ess": boltzmann.effective_sample_size(weights),
+      "log_prob": candidates.log_prob(actions, q)[0],
+    }
+    return actions[0], info
 
   def update(
-    state: LearnerState, batch: Transition, key: Array
+    state: LearnerState, batch: Transition, key: PRNGKeyArray
   ) -> tuple[LearnerState, Metrics]:
     key_t, key_tm1 = jax.random.split(key)
     if config.image_shift or config.color_jitter:
@@ -98,25 +121,21 @@ def make_agent(config: AgentConfig) -> Agent:
         jitter=config.color_jitter,
         together=config.lstm_instants > 0,
       )
+    # Take one gradient of all losses, with targets from the target network.
     target = bellman_target(
       networks, algorithm, evaluation, state.target_params, batch, key_t
     )
     trained = {**state.params, "nu": state.nu}
-    grads, metrics = jax.grad(total_loss, argnums=3, has_aux=True)(
-      networks,
-      algorithm,
-      evaluation,
-      trained,
-      state.target_params,
-      batch,
-      target,
-      key_tm1,
+    grads, metrics = jax.grad(loss, has_aux=True)(
+      trained, state.target_params, batch, target, key_tm1
     )
+    # Step all optimizers, and keep nu nonnegative.
     steps, opt_state = optimizer.update(grads, state.opt_state, trained)
     params = jax.tree.map(jnp.add, trained, steps)
     nu = jnp.maximum(params.pop("nu"), 0.0)
     metrics |= {f"grad_norm/{k}": optax.tree.norm(grads[k]) for k in groups}
     metrics["prior/nu"] = nu
+    # Move the target network towards the new parameters.
     target_params = jax.tree.map(
       lambda new, old: old + config.target_rate * (new - old),
       params,
@@ -130,9 +149,9 @@ def make_agent(config: AgentConfig) -> Agent:
 def make_optimizer(
   config: AgentConfig, groups: tuple[str, ...]
 ) -> optax.GradientTransformation:
-  """Adam with a clipped global norm for each step of Algorithm 1, by group.
+  """Builds an Adam with a clipped global norm for each step of Algorithm 1.
 
-  A parametric policy has one of its own, at the rate of the E-step that it belongs to.
+  A parametric policy has an Adam of its own, at the learning rate of the E-step.
   """
 
   def adam(learning_rate: optax.ScalarOrSchedule) -> optax.GradientTransformation:
@@ -155,74 +174,23 @@ def make_optimizer(
   return optax.partition({k: adam(rates[k]) for k in labels.values()}, labels)
 
 
-def _act(
-  networks: Networks,
-  algorithm: Algorithm,
-  params: Params,
-  observation: Observation,
-  key: Array,
-  *,
-  greedy: bool,
-) -> tuple[Array, Metrics]:
-  """Samples candidates and picks one (paper Sec. III-B)."""
-  key_candidates, key_pick = jax.random.split(key)
-  heads = networks.at(params, observation)
-  candidates = _candidates(
-    algorithm, heads, key_candidates, heads.config.policy_samples, greedy=greedy
-  )
-  q_values, weights = candidates.q_values, candidates.weights
-  chosen = boltzmann.pick(key_pick, weights)
-  actions = jnp.take_along_axis(candidates.actions, chosen[None, :, None], axis=0)
-  q = jnp.take_along_axis(q_values, chosen[None], axis=0)
-  info = {
-    "q": q[0],
-    "q_max": jnp.max(q_values, axis=0),
-    "alpha": heads.alpha(),
-    "ess": boltzmann.effective_sample_size(weights),
-    "log_prob": candidates.log_prob(actions, q)[0],
-  }
-  return actions[0], info
-
-
 def bellman_target(
   networks: Networks,
   algorithm: Algorithm,
   evaluation: Evaluation,
   target_params: Params,
   batch: Transition,
-  key: Array,
-) -> Array:
-  """Target of the values, by the target network (paper Eq. 8, Sec. V-B)."""
+  key: PRNGKeyArray,
+) -> Float[Array, " B *n"]:
+  """Computes the target of the values with the target network (Eq. 8, Sec. V-B)."""
 
-  def look(observation: Observation) -> tuple[Heads, Candidates]:
+  def policy_at(observation: Observation) -> tuple[Heads, Candidates]:
     heads = networks.at(target_params, observation)
-    return heads, _candidates(algorithm, heads, key, heads.config.target_samples)
+    prior = algorithm.regularizer(heads, heads)
+    samples = networks.config.target_samples
+    return heads, algorithm.policy(heads, prior, key, num_samples=samples)
 
-  return evaluation.target(look, batch)
-
-
-def _candidates(
-  algorithm: Algorithm,
-  heads: Heads,
-  key: Array,
-  num_samples: int,
-  *,
-  greedy: bool = False,
-) -> Candidates:
-  """The policy of these heads, which are their own past if the regularizer asks."""
-  prior = algorithm.regularizer(heads, heads)
-  return algorithm.policy(heads, prior, key, num_samples=num_samples, greedy=greedy)
-
-
-def _ap_errors(predicted: Array, label: Array) -> Metrics:
-  """Mean error of the primitives' velocities, rad/s, and share of wrong gripper
-  commands, f32[*b] each."""
-  velocity = jnp.abs(predicted - label)[..., :-1]
-  wrong = (predicted[..., -1] > 0) != (label[..., -1] > 0)
-  return {
-    "ap/error": jnp.mean(velocity, axis=(-2, -1)),
-    "ap/gripper_error": jnp.mean(wrong, axis=-1),
-  }
+  return evaluation.target(policy_at, batch)
 
 
 def total_loss(
@@ -232,27 +200,33 @@ def total_loss(
   trained: Params,
   target_params: Params,
   batch: Transition,
-  target: Array,
-  key: Array,
-) -> tuple[Array, Metrics]:
-  """Sum of the losses of Algorithm 1; each reaches only its own parameters."""
+  target: Float[Array, " B *n"],
+  key: PRNGKeyArray,
+) -> tuple[Float[Array, ""], Metrics]:
+  """Sums the losses of Algorithm 1; each trains only its own parameters."""
   config = networks.config
+  # Evaluate the networks at s_tm1.
   heads = networks.at(trained, batch.observation_tm1)
   slow = networks.at(target_params, batch.observation_tm1)
-  predicted = heads.primitives()
+  predicted, label = heads.primitives(), batch.primitives_tm1
   outputs = heads.z(batch.action_tm1[None])[0]
+  # Improve the policy, and compute the losses of all columns of Table I.
   prior = algorithm.regularizer(heads, slow)
   improved = algorithm.policy_update(heads, prior, key)
   candidates = improved.candidates
   q_values, weights = candidates.q_values, improved.weights
   terms = {
-    "loss/ap": losses.ap_loss(predicted, batch.primitives_tm1, delta=config.ap_delta),
+    "loss/ap": losses.ap_loss(predicted, label, delta=config.ap_delta),
     "loss/q": evaluation.loss(outputs, target),
     **improved.losses,
     **algorithm.regularizer_update(heads, prior, candidates, batch, key, trained["nu"]),
   }
+  # Average losses and diagnostics over the real transitions of the batch.
+  velocity_error = jnp.abs(predicted - label)[..., :-1]
+  wrong_gripper = (predicted[..., -1] > 0) != (label[..., -1] > 0)
   per_state = terms | {
-    **_ap_errors(predicted, batch.primitives_tm1),
+    "ap/error": jnp.mean(velocity_error, axis=(-2, -1)),  # rad/s
+    "ap/gripper_error": jnp.mean(wrong_gripper, axis=-1),  # share of wrong commands
     "npql/kl_over_eps": improved.kl / config.epsilon,
     "npql/ess": boltzmann.effective_sample_size(weights),
     "npql/alpha_mean": heads.alpha(),

@@ -1,189 +1,178 @@
-"""The losses, one number per state, without networks or parameters.
+"""The losses of the paper as functions of arrays, one number per state.
 
-``*b`` are any batch axes, S candidate actions come first. What a loss must not
-train is stopped here or in ``Heads``, so that the gradients of a sum of all
-losses fall apart into the groups that the paper's Algorithm 1 names.
+Shapes are jaxtyping's and are not checked at run time: ``s`` candidate actions per
+state come first, ``*b`` are batch axes and ``n`` counts atoms. Time suffixes follow
+rlax: ``_tm1`` is the state acted upon, ``_t`` the state it led to.
+
+``stop_gradient``, here and in ``Heads``, keeps each loss from parameters that it must
+not train. One gradient of the sum of all losses therefore serves all steps of the
+paper's Algorithm 1.
 """
 
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 import optax
 
 from apnpql_jax.dists import boltzmann, categorical
 from apnpql_jax.dists.action import ActionDistribution
-from apnpql_jax.types import Array
 
 
-def weighted_mean(losses: Array, weight: Array) -> Array:
-  """Mean of f32[*b] losses under f32[*b] weights >= 0; zero if all weights are."""
+def weighted_mean(
+  losses: Float[Array, "*b"], weight: Float[Array, "*b"]
+) -> Float[Array, ""]:
+  """Returns the mean under weights >= 0, or zero if all weights are zero."""
   return jnp.sum(weight * losses) / jnp.maximum(jnp.sum(weight), 1e-6)
 
 
-def ap_loss(predicted: Array, label: Array, *, delta: float) -> Array:
-  """Behavior cloning of the action primitives, L^ap (paper Eq. 10).
+def ap_loss(
+  predicted: Float[Array, "*b 3 7"], label: Float[Array, "*b 3 7"], *, delta: float
+) -> Float[Array, "*b"]:
+  """Computes the behavior-cloning loss of the action primitives (paper Eq. 10).
 
-  Velocities by a Huber loss: quadratic below ``delta`` (rad/s), where the arm closes in
-  on its target, and linear above, where labels of distant targets saturate. Gripper
-  commands by cross-entropy.
+  L^ap = mean Huber(v - v*) / delta + mean cross-entropy(g, g*)
+
+  The Huber loss is quadratic below ``delta``, where the arm closes in on its target,
+  and linear above, where the labels of distant targets saturate.
 
   Args:
-    predicted: f32[*b, 3, 7], velocities in rad/s and the logit of closing.
-    label: f32[*b, 3, 7], velocities in rad/s and the command in {0, 1}.
+    predicted: velocities v in rad/s and the logit g of closing the gripper.
+    label: velocities v* in rad/s and the gripper command g* in {0, 1}.
     delta: width of the quadratic part, rad/s.
-
-  Returns:
-    f32[*b], mean over primitives and joints in units of ``delta``, plus the mean
-    cross-entropy over primitives in nats.
   """
   velocity, close = predicted[..., :-1], predicted[..., -1]
+  # Average the velocity loss over primitives and joints, in units of delta.
   huber = optax.losses.huber_loss(velocity, label[..., :-1], delta=delta) / delta
+  # Average the gripper loss over primitives, in nats.
   entropy = optax.losses.sigmoid_binary_cross_entropy(close, label[..., -1])
   return jnp.mean(huber, axis=(-2, -1)) + jnp.mean(entropy, axis=-1)
 
 
 def value_target(
-  logits_t: Array, weights_t: Array, reward_t: Array, discount_t: Array, atoms: Array
-) -> Array:
-  """Distributional N-step target E_{a ~ q}[z-bar] (paper Eq. 8, right side).
+  logits_t: Float[Array, " s *b n"],
+  weights_t: Float[Array, " s *b"],
+  reward_t: Float[Array, "*b"],
+  discount_t: Float[Array, "*b"],
+  atoms: Float[Array, " n"],
+) -> Float[Array, "*b n"]:
+  """Computes the distributional N-step target (paper Eq. 8, right side).
 
-  The expectation over candidates comes before the projection, which is linear.
+  Z-bar = project(r + gamma^N Z'(s_t, a)), a ~ q
 
   Args:
-    logits_t: f32[S, *b, n] target network's Z(s_t, a_i).
-    weights_t: f32[S, *b] importance weights of the candidates.
-    reward_t: f32[*b] discounted sum of N rewards.
-    discount_t: f32[*b] gamma^N, zero where the episode terminated.
-    atoms: f32[n] support.
+    logits_t: target network's Z' of the candidates at the bootstrap state.
+    weights_t: importance weights of the candidates.
+    reward_t: discounted sum of N rewards.
+    discount_t: gamma^N, zero where the episode terminated.
+    atoms: support of the returns.
 
   Returns:
-    f32[*b, n] probabilities, without gradient.
+    Probabilities of the atoms, without gradient.
   """
+  # Average over candidates first: the projection is linear, so one per state is enough.
   probs_t = jnp.sum(weights_t[..., None] * jax.nn.softmax(logits_t), axis=0)
+  # Shift and shrink the returns, and project them back onto the atoms.
   target = categorical.project(probs_t, reward_t, discount_t, atoms)
   return jax.lax.stop_gradient(target)
 
 
-def q_loss(logits_tm1: Array, target: Array) -> Array:
-  """Cross-entropy of Z(s_tm1, a_tm1) to the target, L^Q (paper Eq. 8).
-
-  Args:
-    logits_tm1: f32[*b, n].
-    target: f32[*b, n] probabilities.
-
-  Returns:
-    f32[*b].
-  """
+def q_loss(
+  logits_tm1: Float[Array, "*b n"], target: Float[Array, "*b n"]
+) -> Float[Array, "*b"]:
+  """Computes the cross-entropy L^Q = -sum_j Z-bar_j log Z(s_tm1, a_tm1)_j (Eq. 8)."""
   return categorical.cross_entropy(target, logits_tm1)
 
 
 def retrace_target(
-  reward_t: Array, discount_t: Array, value_t: Array, q_t: Array, trace_t: Array
-) -> Array:
-  """Retrace return of (s_0, a_0) over a window of N instants (Munos 2016, Eq. 4).
+  reward_t: Float[Array, "*b N"],
+  discount_t: Float[Array, "*b N"],
+  value_t: Float[Array, "*b N"],
+  q_t: Float[Array, "*b N"],
+  trace_t: Float[Array, "*b N"],
+) -> Float[Array, "*b"]:
+  """Computes the Retrace return of (s_0, a_0) over N instants (Munos 2016, Eq. 4).
 
-  Instants t = 1..N stand on the last axis. G_{t-1} = r_t + gamma_t (V(s_t) +
-  c_t (G_t - Q(s_t, a_t))), where G_N = Q(s_N, a_N); Q(s_0, a_0) cancels.
+  G_{t-1} = r_t + gamma_t (V(s_t) + c_t (G_t - Q(s_t, a_t))), G_N = Q(s_N, a_N)
+
+  The last axis holds the instants t = 1..N; Q(s_0, a_0) cancels.
 
   Args:
-    reward_t: f32[*b, N] received on arriving at t.
-    discount_t: f32[*b, N] gamma, zero where the episode terminated on arriving at t.
-    value_t: f32[*b, N] E_pi[Q(s_t, .)].
-    q_t: f32[*b, N] Q(s_t, a_t).
-    trace_t: f32[*b, N] c_t = min(1, pi / mu), zero where the episode ended at t.
+    reward_t: reward received on arrival at t.
+    discount_t: gamma_t, zero where the episode terminated on arrival at t.
+    value_t: V(s_t) = E_pi[Q(s_t, .)].
+    q_t: Q(s_t, a_t).
+    trace_t: c_t = min(1, pi / mu), zero where the episode ended at t.
 
   Returns:
-    f32[*b], without gradient.
+    G_0, without gradient.
   """
-  target = q_t[..., -1]  # Nothing is known beyond the window: no correction there.
+  target = q_t[..., -1]  # No data beyond the window, so no correction at its end.
   for t in reversed(range(reward_t.shape[-1])):
-    beyond = trace_t[..., t] * (target - q_t[..., t])
-    target = reward_t[..., t] + discount_t[..., t] * (value_t[..., t] + beyond)
+    correction = trace_t[..., t] * (target - q_t[..., t])
+    target = reward_t[..., t] + discount_t[..., t] * (value_t[..., t] + correction)
   return jax.lax.stop_gradient(target)
 
 
-def alpha_loss(q_tm1: Array, alpha_tm1: Array, *, epsilon: float) -> Array:
-  """Dual of the KL limit, to be minimized over alpha(s) (paper Eq. 7).
+def alpha_loss(
+  q_tm1: Float[Array, " s *b"], alpha_tm1: Float[Array, "*b"], *, epsilon: float
+) -> Float[Array, "*b"]:
+  """Computes the dual of KL(q || b) <= epsilon, in nats, over alpha (paper Eq. 7).
 
-  Args:
-    q_tm1: f32[S, *b] values of candidates drawn from the prior; not trained.
-    alpha_tm1: f32[*b].
-    epsilon: limit of KL(q || b) in nats.
-
-  Returns:
-    f32[*b].
+  L^alpha = alpha epsilon + alpha log mean_i exp(Q_i / alpha), a_i ~ b
   """
   q_tm1 = jax.lax.stop_gradient(q_tm1)
   return boltzmann.dual(q_tm1, alpha_tm1, epsilon=epsilon)
 
 
-def kl_dual(kl: Array, alpha_tm1: Array, *, epsilon: float) -> Array:
-  """Dual of KL(pi || b) <= epsilon for a parametric policy, over alpha(s).
+def kl_dual(
+  kl: Float[Array, "*b"], alpha_tm1: Float[Array, "*b"], *, epsilon: float
+) -> Float[Array, "*b"]:
+  """Computes the dual of KL(pi || b) <= epsilon, in nats, for a parametric policy.
 
-  Its slope in alpha is that of Eq. 7, epsilon - KL, with the KL of pi for that of q.
-
-  Args:
-    kl: f32[*b] nats; not trained.
-    alpha_tm1: f32[*b].
-    epsilon: limit in nats.
-
-  Returns:
-    f32[*b].
+  L^alpha = alpha (epsilon - KL), whose slope in alpha is that of Eq. 7 with pi for q
   """
   return alpha_tm1 * (epsilon - jax.lax.stop_gradient(kl))
 
 
 def weighted_nll(
-  distribution: ActionDistribution, samples: Array, weights: Array
-) -> Array:
-  """-sum_i w_i log p(a_i): KL from the weighted samples to p, up to a constant.
+  distribution: ActionDistribution,
+  samples: Float[Array, " s *b 7"],
+  weights: Float[Array, " s *b"],
+) -> Float[Array, "*b"]:
+  """Computes -sum_i w_i log p(a_i) of unclipped actions to train p.
 
-  Args:
-    distribution: p, what is trained.
-    samples: f32[S, *b, 7] unclipped; not trained.
-    weights: f32[S, *b]; not trained.
-
-  Returns:
-    f32[*b].
+  This is the KL from the weighted samples to p, up to a constant.
   """
   samples, weights = jax.lax.stop_gradient((samples, weights))
   return -jnp.sum(weights * distribution.log_prob(samples), axis=0)
 
 
 def m_step_loss(
-  prior: ActionDistribution, samples: Array, weights: Array, nu: Array
-) -> Array:
-  """Fits the prior to q and keeps it broad, L^M (paper Eq. 9).
+  prior: ActionDistribution,
+  samples: Float[Array, " s *b 7"],
+  weights: Float[Array, " s *b"],
+  nu: Float[Array, ""],
+) -> Float[Array, "*b"]:
+  """Computes the M-step loss of the prior (paper Eq. 9).
 
-  -sum_i w_i log b(a_i) - nu H(b): the first term is KL(q || b) up to a constant.
-  The paper prints + nu H(b) but introduces the term for exploration, so entropy is
-  rewarded. H is a lower bound, which makes the floor a safe one.
+  L^M = -sum_i w_i log b(a_i) - nu H(b)
 
-  Args:
-    prior: b_theta(. | s_tm1) with gradients to theta^bp.
-    samples: f32[S, *b, 7] unclipped actions.
-    weights: f32[S, *b] of q, or of another policy, on them.
-    nu: f32[] multiplier >= 0.
-
-  Returns:
-    f32[*b].
+  The first term is KL(q || b) up to a constant. The paper prints + nu H(b) but
+  introduces the term for exploration, so entropy is rewarded here. H is a lower bound:
+  if it is above the floor, so is the entropy. ``samples`` are unclipped, ``weights``
+  those of q or of another policy.
   """
   nll = weighted_nll(prior, samples, weights)
   return nll - jax.lax.stop_gradient(nu) * prior.entropy_bound()
 
 
-def nu_loss(nu: Array, entropy: Array, *, epsilon_nu: float) -> Array:
-  """Dual of the entropy floor, nu (H(b) - epsilon_nu) (text below paper Eq. 9).
+def nu_loss(
+  nu: Float[Array, ""], entropy: Float[Array, "*b"], *, epsilon_nu: float
+) -> Float[Array, "*b"]:
+  """Computes the dual of H(b) >= epsilon_nu, in nats (text below paper Eq. 9).
 
-  Minimized over nu >= 0: nu grows while the entropy is below its floor.
-
-  Args:
-    nu: f32[].
-    entropy: f32[*b] entropy of the prior in nats; not trained.
-    epsilon_nu: the floor in nats.
-
-  Returns:
-    f32[*b].
+  L^nu = nu (H(b) - epsilon_nu), so nu >= 0 grows while the entropy is below its floor
   """
   return nu * (jax.lax.stop_gradient(entropy) - epsilon_nu)

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 from flax import linen as nn
 import jax.numpy as jnp
-
-from apnpql_jax.types import Array
+from jaxtyping import Array, Float
 
 _small = nn.initializers.variance_scaling(1e-4, "fan_in", "truncated_normal")
 
@@ -19,28 +18,28 @@ class Head(nn.Module):
   out: int
 
   @nn.compact
-  def __call__(self, x: Array) -> Array:
-    """f32[*b, n] -> f32[*b, out]."""
+  def __call__(self, x: Float[Array, "*b n"]) -> Float[Array, "*b out"]:
+    """Applies the layers."""
     for width in self.hidden:
       x = nn.relu(nn.Dense(width)(x))
     return nn.Dense(self.out, kernel_init=_small, name="out")(x)
 
 
 class Constant(nn.Module):
-  """One trained number for all states, in the place of a ``Head`` with one output."""
+  """One trained number for all states, in place of a ``Head`` with one output."""
 
   @nn.compact
-  def __call__(self, x: Array) -> Array:
-    """f32[*b, n] -> f32[*b, 1]."""
+  def __call__(self, x: Float[Array, "*b n"]) -> Float[Array, "*b 1"]:
+    """Returns the number for every state."""
     value = self.param("value", nn.initializers.zeros, (1,))
     return jnp.broadcast_to(value, (*x.shape[:-1], 1))
 
 
 class ValueHead(nn.Module):
-  """Z_eta: values of many candidate actions of one state.
+  """Z_eta: values of many candidate actions per state.
 
-  The first layer is W_phi phi + W_a a; the large half is computed once per state.
-  Candidates and states stay apart, so that devices can divide the states.
+  The first layer is W_phi phi + W_a a; its larger part is computed once per state.
+  Candidates and states have separate axes, so that devices can divide the states.
   """
 
   hidden: Sequence[int]
@@ -48,8 +47,10 @@ class ValueHead(nn.Module):
   """Outputs before training, one per unit of the last layer."""
 
   @nn.compact
-  def __call__(self, phi: Array, actions: Array) -> Array:
-    """phi f32[*b, n], actions f32[S, *b, 7] -> f32[S, *b, len(initial)]."""
+  def __call__(
+    self, phi: Float[Array, "*b m"], actions: Float[Array, " s *b 7"]
+  ) -> Float[Array, " s *b n"]:
+    """Returns as many outputs per action as ``initial`` has."""
     width, *rest = self.hidden
     from_phi = nn.Dense(width, name="phi")(phi)
     centered = actions.at[..., -1].set(2.0 * actions[..., -1] - 1.0)
@@ -64,15 +65,17 @@ class ValueHead(nn.Module):
 
 
 class TwinValueHeads(nn.Module):
-  """Two value heads that share nothing but phi; their outputs stand side by side."""
+  """Two value heads that share only phi."""
 
   hidden: Sequence[int]
   initial: Sequence[float]
   """Outputs before training, those of the first head, then those of the second."""
 
   @nn.compact
-  def __call__(self, phi: Array, actions: Array) -> Array:
-    """phi f32[*b, n], actions f32[S, *b, 7] -> f32[S, *b, len(initial)]."""
+  def __call__(
+    self, phi: Float[Array, "*b m"], actions: Float[Array, " s *b 7"]
+  ) -> Float[Array, " s *b n"]:
+    """Concatenates the outputs of both heads."""
     half = len(self.initial) // 2
     heads = (
       ValueHead(self.hidden, self.initial[:half], name="first"),

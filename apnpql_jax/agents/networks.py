@@ -1,9 +1,9 @@
-"""What the networks say of a batch of states (paper Fig. 2 and Sec. IV-B).
+"""The networks, built from the settings (paper Fig. 2 and Sec. IV-B).
 
 The features phi are computed once per observation and reused for every candidate
-action. Parameters live in groups, so that each can have its own optimizer: encoder,
-ap (predicted primitives), z (value), alpha; where the algorithm has them also bp (the
-rest of the prior) and policy.
+action. Each group of parameters can have its own optimizer: encoder, ap (predicted
+primitives), z (value), alpha and, depending on the algorithm, bp (the rest of the
+prior) and policy.
 """
 
 from __future__ import annotations
@@ -14,28 +14,16 @@ from apnpql_jax.agents.heads import Networks
 from apnpql_jax.agents.mixture_head import mixture_size
 from apnpql_jax.agents.modules import Constant, Head
 from apnpql_jax.config.schema import AgentConfig
-from apnpql_jax.types import (
-  ACTION_DIM,
-  NUM_PRIMITIVES,
-)
+from apnpql_jax.types import ACTION_DIM, NUM_PRIMITIVES
 
 
 def make_networks(
   config: AgentConfig, groups: tuple[str, ...], evaluation: Evaluation
 ) -> Networks:
-  """The modules of the paper's Fig. 2, those of ``groups``, sized by ``config``."""
-  hidden = config.hidden
-  learned_mean = config.prior_mean == "learned"
+  """Builds the modules of ``groups``, with the sizes of ``config``."""
+  hidden, learned_mean = config.hidden, config.prior_mean == "learned"
   modules = {
-    "encoder": Encoder(
-      config.feature_dim,
-      (config.patch_channels, config.conv_channels),
-      config.conv_overlap,
-      config.residual_blocks,
-      config.global_features,
-      config.wrist_features,
-      config.lstm_instants,
-    ),
+    "encoder": Encoder(config),
     "ap": Head(hidden, NUM_PRIMITIVES * ACTION_DIM),
     "bp": Head(hidden, NUM_PRIMITIVES * mixture_size(own_mean=learned_mean)),
     "z": evaluation.head(hidden),

@@ -1,6 +1,6 @@
 """The rows of the paper's Table I.
 
-An algorithm is one choice per column; the learner calls the columns and knows no
+An algorithm is one choice per column. The learner calls the columns and refers to no
 algorithm by name.
 """
 
@@ -44,24 +44,22 @@ class Algorithm:
   """One row of Table I; the columns are functions."""
 
   regularizer: Callable[..., ActionDistribution]
-  """b: (heads, target network's heads) -> distribution the policy is kept close to."""
+  """(heads, target network's heads) -> b, which limits the policy."""
 
   policy: Callable[..., Candidates]
-  """What acts and is evaluated: (heads, b, key, num_samples, greedy) -> weighted
-  candidates."""
+  """(heads, b, key, num_samples, greedy) -> weighted candidates."""
 
   regularizer_update: Callable[..., Losses]
-  """(heads, b, candidates, batch, key, nu) -> losses of b and nu; the candidates are
-  those of the improved policy."""
+  """(heads, b, improved policy's candidates, batch, key, nu) -> losses of b and nu."""
 
   policy_update: Callable[..., Improvement]
-  """(heads, b, key) -> the improved policy, and the losses of psi and alpha."""
+  """(heads, b, key) -> improved policy, with the losses of psi and alpha."""
 
   policy_evaluation: Callable[[AgentConfig], Evaluation]
-  """Value head, target and loss."""
+  """settings -> value head, target and loss."""
 
   def groups(self, config: AgentConfig) -> tuple[str, ...]:
-    """Parameter groups that the columns read, in the order of ``GROUPS``."""
+    """Returns the parameter groups that the columns read, in order of ``GROUPS``."""
     absent = {
       "bp": self.regularizer is not behavior_prior,
       "policy": self.policy is not parametric,
@@ -74,19 +72,19 @@ ALGORITHMS = {
   # regularizer      policy          regularizer       policy      policy
   #                                  update            update      evaluation
   "ap_npql": Algorithm(
-    behavior_prior, non_parametric, fit_candidates,   none,       Categorical,
+    behavior_prior,  non_parametric, fit_candidates,   none,       Categorical,
   ),
   "ap_mpo": Algorithm(
-    behavior_prior, parametric,     fit_candidates,   forward_kl, Categorical,
+    behavior_prior,  parametric,     fit_candidates,   forward_kl, Categorical,
   ),
   "ap_sac": Algorithm(
-    behavior_prior, parametric,     fit_candidates,   reverse_kl, Categorical,
+    behavior_prior,  parametric,     fit_candidates,   reverse_kl, Categorical,
   ),
   "abm_mpo": Algorithm(
-    behavior_prior, parametric,     fit_advantageous, forward_kl, TD0,
+    behavior_prior,  parametric,     fit_advantageous, forward_kl, TD0,
   ),
   "svg_prior": Algorithm(
-    behavior_prior, parametric,     fit_candidates,   reverse_kl, Retrace,
+    behavior_prior,  parametric,     fit_candidates,   reverse_kl, Retrace,
   ),
   "mpo": Algorithm(
     previous_policy, parametric,     no_update,        forward_kl, Retrace,
@@ -95,10 +93,10 @@ ALGORITHMS = {
     uniform,         parametric,     no_update,        reverse_kl, ClippedDoubleQ,
   ),
   "ap_cem": Algorithm(
-    behavior_prior, cem,            fit_candidates,   none,       ClippedDoubleQ,
+    behavior_prior,  cem,            fit_candidates,   none,       ClippedDoubleQ,
   ),
 }  # fmt: skip
-"""The last row is not in the table: QT-Opt's policy, for b with action primitives."""
+"""The last row is not in the paper: QT-Opt's policy with b around action primitives."""
 
 EVALUATIONS = {
   "categorical": Categorical,
@@ -106,15 +104,15 @@ EVALUATIONS = {
   "retrace": Retrace,
   "clipped_double_q": ClippedDoubleQ,
 }
-"""Values of ``agent.policy_evaluation`` beside "row"."""
+"""Values of ``agent.policy_evaluation`` other than "row"."""
 
 
 def algorithm_of(config: AgentConfig) -> Algorithm:
-  """The row that ``config`` names, with the columns that it replaces.
+  """Returns the row that ``config`` names, with the columns that it replaces.
 
   Raises:
-    ConfigError: no such row; the message lists the valid names. Or Retrace for a
-      policy without a density.
+    ConfigError: for an unknown row; the message lists the valid names. Also for Retrace
+      with a policy without a density.
   """
   check_name("agent.algorithm", config.algorithm, tuple(ALGORITHMS))
   row = ALGORITHMS[config.algorithm]
@@ -125,19 +123,19 @@ def algorithm_of(config: AgentConfig) -> Algorithm:
     row = dataclasses.replace(row, policy_evaluation=evaluation)
   if row.policy is cem and row.policy_evaluation is Retrace:
     raise ConfigError(
-      "agent.policy_evaluation retrace needs the density of the policy, and that of "
-      "the best of many draws is not known; choose another for ap_cem"
+      "agent.policy_evaluation retrace needs the density of the policy, which ap_cem "
+      "lacks; choose another policy evaluation"
     )
   return row
 
 
 def epsilon_bounds() -> dict[str, tuple[str, ...]]:
-  """Name of each row -> settings that say how many candidates q weighs somewhere; below
-  the log of each of them epsilon must lie."""
+  """Returns per row the settings with the numbers of candidates that q weighs.
 
-  def bounds(row: Algorithm) -> tuple[str, ...]:
-    target = ("target_samples",) if row.policy is non_parametric else ()
-    update = ("policy_samples",) if row.policy_update is not reverse_kl else ()
-    return (*target, *update)
-
-  return {name: bounds(row) for name, row in ALGORITHMS.items()}
+  ``epsilon`` must lie below the log of each of them.
+  """
+  return {
+    name: ("target_samples",) * (row.policy is non_parametric)
+    + ("policy_samples",) * (row.policy_update is not reverse_kl)
+    for name, row in ALGORITHMS.items()
+  }

@@ -116,7 +116,7 @@ def replay_bytes(config: TrainConfig) -> int:
 
 
 def _check_values(values: Mapping[str, Any]) -> None:
-  """Checks each setting by itself; ``values`` maps dotted names to values."""
+  """Checks each setting on its own; ``values`` maps dotted names to values."""
   for name, value in values.items():
     if isinstance(value, float) and not math.isfinite(value):
       raise ConfigError(f"{name}={value} is not a finite number")
@@ -204,7 +204,7 @@ def _check_expert(config: TrainConfig) -> None:
   if abs(expert - round(expert)) > 1e-6:
     raise ConfigError(
       f"replay.batch_size={replay.batch_size} times replay.expert_share="
-      f"{replay.expert_share} is not whole; use expert_share="
+      f"{replay.expert_share} is not an integer; use expert_share="
       f"{round(expert) / replay.batch_size:.6g}"
     )
   if replay.expert_steps % config.env.worlds:

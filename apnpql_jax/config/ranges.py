@@ -52,8 +52,7 @@ class RandomizationConfig:
   """Ambient and direct light, relative."""
 
   camera_shift: float = 0.02
-  """Position of the global camera along each axis in m; the wrist camera moves a tenth
-  of this."""
+  """Position of the global camera along each axis in m; a tenth for the wrist's."""
 
   camera_turn: float = 0.02
   """Orientation of the cameras about each axis in rad."""
@@ -68,15 +67,13 @@ class RandomizationConfig:
   """Tilt of the table against the robot's base about both horizontal axes in rad."""
 
   table_turn: float = 0.05
-  """Rotation of the table and everything on it about the robot's vertical axis in
-  rad."""
+  """Rotation of the table and all objects about the robot's vertical axis in rad."""
 
   size: float = 0.05
   """Size of each object, relative."""
 
   shape: float = codec.added(0.04, before=0.0)
-  """Ratio of height to width of each object, relative. flip_cup always draws one of
-  three cup shapes."""
+  """Height-to-width ratio of each object, relative; flip_cup also has three cups."""
 
   mass: float = 0.3
   """Mass of each object, relative."""

@@ -74,8 +74,7 @@ class AgentConfig:
   """Rewards summed before the value target bootstraps."""
 
   learning_rate_e: float = 3e-4
-  """Adam learning rate of the E-step (features, action primitives, value) and of the
-  parametric policy, if there is one."""
+  """Adam learning rate of the E-step (features, primitives, value, policy network)."""
 
   learning_rate_m: float = 3e-4
   """Adam learning rate of the M-step (parametric prior)."""
@@ -120,8 +119,7 @@ class AgentConfig:
   """What the policy stays close to: row (as in Table I) or uniform (no prior)."""
 
   policy_evaluation: str = "row"
-  """How values are learned: row (as in Table I), categorical, td0, retrace or
-  clipped_double_q. Set n_step to 1 for textbook TD(0)."""
+  """Value loss: row (as in Table I), categorical, td0, retrace or clipped_double_q."""
 
   prior_mean: str = "primitives"
   """Means of the prior: primitives (predicted) or learned (by the M-step)."""
@@ -148,18 +146,16 @@ class AgentConfig:
   """Channels of the second convolution of each camera."""
 
   residual_blocks: int = codec.added(0)
-  """Residual blocks (two 3x3 convolutions each) after the second convolution of each
-  camera; the paper has none. Slow on a CPU."""
+  """Residual blocks per camera, none in the paper; slow on a CPU."""
 
   lstm_instants: int = codec.added(0)
   """Time steps that an LSTM reads, each with its images (Fig. 2); 0: no LSTM."""
 
   global_features: str = codec.added("map")
-  """Features from the convolutions of the global camera: map (flattened), keypoints
-  (where each channel is strongest; learns from fewer scenes) or both."""
+  """Features of the global camera: map, keypoints (learn from fewer scenes) or both."""
 
   wrist_features: str = codec.added("map")
-  """Features from the convolutions of the wrist camera: map, keypoints or both."""
+  """Features of the wrist camera: map, keypoints or both."""
 
   conv_overlap: bool = True
   """Second convolution 3x3 with stride 2; otherwise 2x2 patches, faster but coarser."""
@@ -174,8 +170,7 @@ class AgentConfig:
   """Error in rad/s above which the loss of the action primitives is linear."""
 
   m_step_delay: int = 0
-  """Updates before the M-step begins. Until values are accurate, the prior would follow
-  their errors away from the action primitives."""
+  """Updates before the M-step begins, so that the prior ignores early value errors."""
 
   min_std: float = 0.05
   """Lower bound of the standard deviation of each joint in the prior (rad/s)."""

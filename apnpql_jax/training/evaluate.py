@@ -116,18 +116,9 @@ def evaluate(
     say(line)
   learner = found.items["learner"]
   play = make_player(env, lambda params: agent_policy(agent, params, greedy=greedy))
-  figures = _figures(
-    env, play, learner.target_params, episodes=episodes, seed=seed, video=video
-  )
-  return {
-    "task": config.env.task,
-    "algorithm": config.agent.algorithm,
-    "backend": env.physics.name,
-    "greedy": greedy,
-    **figures,
-    "checkpoint_step": found.step,
-    "wall_s": time.monotonic() - began,
-  }
+  played = play_held_out(env, play, learner.target_params, episodes=episodes, seed=seed)
+  about = {"algorithm": config.agent.algorithm, "greedy": greedy}
+  return _summary(env, played, about, found.step, began, video)
 
 
 def evaluate_expert(
@@ -142,27 +133,25 @@ def evaluate_expert(
   began = time.monotonic()
   env = make_env(env_config)
   play = make_player(env, lambda _: expert_policy(env, noise=noise))
-  figures = _figures(env, play, None, episodes=episodes, seed=seed, video=video)
-  return {
-    "task": env_config.task,
-    "algorithm": "expert",
-    "backend": env.physics.name,
-    **figures,
-    "checkpoint_step": None,
-    "wall_s": time.monotonic() - began,
-  }
+  played = play_held_out(env, play, None, episodes=episodes, seed=seed)
+  return _summary(env, played, {"algorithm": "expert"}, None, began, video)
 
 
-def _figures(
-  env: Env, play: Player, params: Any, *, episodes: int, seed: int, video: Path | None
+def _summary(
+  env: Env,
+  played: Episodes,
+  about: dict[str, Any],
+  step: int | None,
+  began: float,
+  video: Path | None,
 ) -> dict[str, Any]:
-  """Returns the figures of held-out episodes; films the first ones if asked to."""
-  played = play_held_out(env, play, params, episodes=episodes, seed=seed)
-  figures = figures_of(played)
-  if video is None:
-    return figures
-  try:
-    return figures | {"video": str(record_episodes(env, played, video))}
-  except OSError as error:  # The figures took minutes; do not lose them.
-    say(f"cannot write {video}: {error}")
-    return figures | {"video": None}
+  """Returns the figures and their context; films the first episodes if asked to."""
+  summary: dict[str, Any] = {"task": env.config.task, "backend": env.physics.name}
+  summary |= about | figures_of(played)
+  if video is not None:
+    try:
+      summary["video"] = str(record_episodes(env, played, video))
+    except OSError as error:  # The episodes took minutes; keep their figures.
+      say(f"cannot write {video}: {error}")
+      summary["video"] = None
+  return summary | {"checkpoint_step": step, "wall_s": time.monotonic() - began}

@@ -98,8 +98,8 @@ def replay_from_demonstrations(
   def remake(
     start: EnvState, index: Array, fresh: Array, targets: Array, ends: Array
   ) -> Replay:
-    def instant(before: EnvState, seen: tuple) -> tuple[EnvState, Slot]:
-      rows, fresh, targets, ends = seen
+    def step(before: EnvState, inputs: tuple) -> tuple[EnvState, Slot]:
+      rows, fresh, targets, ends = inputs
       now = _states(demos, env.task.scene, rows)
       state = env.observe(Arrival.after(before, now, targets, fresh))
       timestep = state.timestep
@@ -109,7 +109,7 @@ def replay_from_demonstrations(
       action = jnp.asarray(demos.action, jnp.float32)[rows]
       return state, Slot(timestep, action, jnp.full(worlds, CERTAIN, jnp.float32))
 
-    _, chunk = jax.lax.scan(instant, start, (index, fresh, targets, ends))
+    _, chunk = jax.lax.scan(step, start, (index, fresh, targets, ends))
     ring = replay.add(replay.create(example_slot(start), length, worlds), chunk)
     return place(ring, env.mesh)
 
@@ -186,7 +186,7 @@ def _solve_targets(demos: Demonstrations, rows: np.ndarray, env: Env) -> np.ndar
   far = (residuals > [ik.POSITION_TOLERANCE, ik.ROTATION_TOLERANCE]).any((1, 2))
   if far.any():
     raise FileError(
-      f"demonstrations: the arm cannot reach a primitive's target at instant "
+      f"demonstrations: the arm cannot reach a primitive's target at time step "
       f"{unique[far.argmax()]}"
     )
   return targets.astype(np.float32)[inverse]

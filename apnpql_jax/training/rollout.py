@@ -95,7 +95,7 @@ def make_player(env: Env, make_policy: Callable[[Any], Policy]) -> Player:
   def play(params: Any, rows: Array, key: Array) -> Episodes:
     policy = make_policy(params)
 
-    def instant(carry):
+    def step(carry):
       now, played, running, time, key = carry
       state = env.observe(now)
       running &= state.faults == 0
@@ -124,6 +124,6 @@ def make_player(env: Env, make_policy: Callable[[Any], Policy]) -> Player:
       ),
     )
     start = (now, nothing, jnp.ones(worlds, bool), 0, key)
-    return jax.lax.while_loop(lambda carry: carry[2].any(), instant, start)[1]
+    return jax.lax.while_loop(lambda carry: carry[2].any(), step, start)[1]
 
   return play

@@ -1,4 +1,4 @@
-"""Videos of episodes: the whole robot beside what both cameras see."""
+"""Videos of episodes: a view of the robot next to the images of both cameras."""
 
 from __future__ import annotations
 

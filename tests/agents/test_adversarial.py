@@ -1,4 +1,4 @@
-"""No batch, however absurd, makes a number that is none."""
+"""Updates on absurd batches: all numbers stay finite."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from apnpql_jax.types import Array, Transition
 
 BATCH, ROWS = 6, 32
 KEPT = ("action", "discount", "weight", "terminated", "truncated")
-"""Parts of a transition that are in order whatever happens."""
+"""Parts of a transition that keep their values."""
 
 
 def absurd_images(key: Array, noise: Array) -> Array:
-  """Each image by itself black, white, a board of single pixels, or noise."""
+  """Makes each image black, white, a checkerboard of single pixels, or noise."""
   row, column = jnp.indices(noise.shape[-3:-1])
   board = jnp.where((row + column) % 2, 255, 0)[..., None]
   kind = jax.random.randint(key, (*noise.shape[:-3], 1, 1, 1), 0, 4)
@@ -33,7 +33,7 @@ def absurd_images(key: Array, noise: Array) -> Array:
 
 
 def absurd_batch(rows: Transition, key: Array) -> Transition:
-  """Every leaf with rows, a size up to 1e6, a sign and images of its own."""
+  """Draws rows, a scale up to 1e6, a sign and images for each leaf independently."""
 
   def change(path: Any, leaf: Array, key: Array) -> Array:
     pick, size, sign, images = jax.random.split(key, 4)
@@ -53,8 +53,8 @@ def absurd_batch(rows: Transition, key: Array) -> Transition:
 
 @pytest.mark.parametrize("updates", [100, pytest.param(1000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_no_batch_makes_a_number_that_is_none(name: str, updates: int):
-  """Rewards and states of 1e6, images far from any seen, in all combinations."""
+def test_no_batch_produces_a_number_that_is_not_finite(name: str, updates: int):
+  """Combines rewards and states up to 1e6 with images unlike any rendered one."""
   config = dataclasses.replace(SMALL, algorithm=name)
   agent = make_agent(config)
   rows = random_batch(2, ROWS, pixels=True, windows=config.n_step)
@@ -70,12 +70,12 @@ def test_no_batch_makes_a_number_that_is_none(name: str, updates: int):
   @functools.partial(jax.jit, compiler_options=testing.FAST_COMPILE)
   def run(state):
     keys = jax.random.split(jax.random.key(1), updates)
-    state, seen = jax.lax.scan(body, state, keys)
+    state, history = jax.lax.scan(body, state, keys)
     last = absurd_batch(rows, jax.random.key(3)).observation_tm1
-    return state, *seen, *agent.act(state.params, last, jax.random.key(2), False)
+    return state, *history, *agent.act(state.params, last, jax.random.key(2), False)
 
   state, metrics, met, action, info = run(state)
-  assert np.any(met)  # A large reward and a white image, in one state.
+  assert np.any(met)  # A large reward and a white image occurred in one state.
   for leaf in jax.tree.leaves((state.params, state.nu, metrics, info)):
     assert np.all(np.isfinite(leaf))
   assert action.shape == (BATCH, 7) and np.all(np.abs(action) <= 1.0)

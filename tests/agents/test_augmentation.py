@@ -1,4 +1,4 @@
-"""Random shifts and color jitter against loops in NumPy."""
+"""Random shifts and color jitter, compared with loops in NumPy."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ CONFIG = AgentConfig(
 
 
 def _crops(image: np.ndarray, most: int) -> list[bytes]:
-  """All shifts of one image, cut out of a larger one."""
-  larger = np.pad(image, ((most, most), (most, most), (0, 0)), "edge")
+  """Returns all shifts of one image, cropped from a padded one."""
+  padded = np.pad(image, ((most, most), (most, most), (0, 0)), "edge")
   height, width = image.shape[:2]
   return [
-    larger[row : row + height, column : column + width].tobytes()
+    padded[row : row + height, column : column + width].tobytes()
     for row in range(2 * most + 1)
     for column in range(2 * most + 1)
   ]
@@ -42,13 +42,13 @@ def test_a_shift_is_a_crop_of_a_padded_image():
     jax.jit(shift_images, static_argnums=2)(jax.random.key(0), IMAGES, 2)
   )
   assert found.shape == IMAGES.shape and found.dtype == np.uint8
-  which = [
+  shifts = [
     _crops(image, 2).index(crop.tobytes())
     for image, crop in zip(
       IMAGES.reshape(-1, 12, 16, 3), found.reshape(-1, 12, 16, 3), strict=True
     )
   ]
-  assert len(set(which)) > 8
+  assert len(set(shifts)) > 8
 
 
 def test_all_shifts_are_equally_likely():
@@ -58,7 +58,7 @@ def test_all_shifts_are_equally_likely():
   )
   crops = _crops(IMAGES[0, 0], 1)
   counts = np.bincount([crops.index(crop.tobytes()) for crop in found], minlength=9)
-  # Mean 222, deviation 14.
+  # The mean is 222, the standard deviation 14.
   assert counts.min() > 160 and counts.max() < 290
 
 
@@ -81,7 +81,7 @@ def test_jitter_multiplies_each_channel():
   assert len(np.unique(np.round(factors, 4))) > 40
 
 
-def test_only_images_change_and_each_by_itself():
+def test_only_images_change_and_each_independently():
   batch = random_batch(0, 4, pixels=True, windows=3)
   other = augment(jax.random.key(0), batch, shift=3, jitter=0.1)
   assert batch.window is not None and other.window is not None
@@ -104,8 +104,8 @@ def test_only_images_change_and_each_by_itself():
   )
 
 
-def test_images_of_one_window_are_changed_alike():
-  """Where all three instants show the same, they still do, but something else."""
+def test_images_of_one_window_change_identically():
+  """Three equal instants stay equal but change."""
   batch = random_batch(0, 4, pixels=True, windows=2, instants=3)
   batch = jax.tree.map(
     lambda x: x[..., :1, :, :, :].repeat(3, -4) if x.dtype == np.uint8 else x, batch
@@ -125,8 +125,8 @@ def test_images_of_one_window_are_changed_alike():
 
 
 @pytest.mark.parametrize("settings", [{"image_shift": 2}, {"color_jitter": 0.2}])
-def test_the_learner_sees_augmented_images_only_if_asked(settings):
-  """The program of an update without them holds nothing of them."""
+def test_the_learner_augments_images_only_if_configured(settings):
+  """Without augmentation its operations are absent from the compiled update."""
   batch = random_batch(0, 4, pixels=True)
   zero = dict.fromkeys(settings, 0)
 

@@ -1,4 +1,4 @@
-"""The agent of the row ap_npql: optimizers, targets, determinism, learning."""
+"""Agent of the row ap_npql: optimizers, targets, determinism, learning."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def update(agent):
 
 
 def test_each_group_moves_at_its_own_learning_rate(state, update):
-  """The first step of Adam is as long as its learning rate."""
+  """The first step of Adam has the size of its learning rate."""
   after, _ = update(state, random_batch(1), jax.random.key(0))
   rates = {
     "encoder": 4e-4,
@@ -66,7 +66,7 @@ def test_each_group_moves_at_its_own_learning_rate(state, update):
     )
     largest = max(jax.tree.leaves(moved))
     assert largest == pytest.approx(rates[group], rel=0.02), group
-  assert after.nu == pytest.approx(1e-4, rel=0.02)  # the entropy is below its floor
+  assert after.nu == pytest.approx(1e-4, rel=0.02)  # The entropy is below its floor.
   assert after.step == 1
 
 
@@ -116,9 +116,11 @@ def test_transitions_of_weight_zero_change_nothing(state, update):
   )
 
 
-def test_an_update_sees_a_batch_without_order(state, update):
-  """What is drawn for a state depends on its place: so no candidate of the target's
-  may be worth more than another here."""
+def test_an_update_ignores_the_order_of_a_batch(state, update):
+  """All candidates of the target have equal values here.
+
+  The candidates of a state depend on its position in the batch.
+  """
   z = dict(state.target_params["z"])
   z["action"] = jax.tree.map(jnp.zeros_like, z["action"])
   z["out"] = z["out"] | {"kernel": 1000.0 * z["out"]["kernel"]}
@@ -132,7 +134,7 @@ def test_an_update_sees_a_batch_without_order(state, update):
   )
   for name in ("loss/q", "loss/ap", "ap/error", "q/data", "q/target"):
     np.testing.assert_allclose(one[name], two[name], rtol=1e-5, err_msg=name)
-  # The states to bootstrap from do count, and belong to theirs.
+  # The states to bootstrap from matter, and so does their pairing with the others.
   assert abs(one["loss/q"] - other["loss/q"]) > 1e-3 * one["loss/q"]
 
 
@@ -146,7 +148,7 @@ def test_update_is_deterministic_and_follows_its_key(state, update):
 
 
 def test_losses_fall_on_a_fixed_batch(agent, state):
-  """Without bootstrap the targets are fixed, so they can be learnt by heart."""
+  """Without bootstrapping the targets are fixed, so they can be memorized."""
   batch = random_batch(5)
   batch = batch.replace(discount_t=jnp.zeros(BATCH))
 
@@ -159,7 +161,7 @@ def test_losses_fall_on_a_fixed_batch(agent, state):
   for name in ("loss/q", "loss/ap", "ap/error"):
     first, last = metrics[name][:10].mean(), metrics[name][-10:].mean()
     assert last < 0.3 * first, name
-  # The temperature follows its dual: the KL limit comes into force.
+  # The temperature follows its dual, so that the KL limit becomes active.
   kl = metrics["npql/kl_over_eps"]
   assert kl[:10].mean() < 0.1
   assert 0.4 < kl[-100:].mean() < 1.5
@@ -193,7 +195,7 @@ def test_actions_lie_in_the_action_box(agent, state):
 
 
 def test_greedy_takes_the_best_candidate(agent, state):
-  """Values are made to prefer a closed gripper and a fast first joint."""
+  """The parameters are set to prefer a closed gripper and a fast first joint."""
   params = jax.tree.map(lambda x: x, state.params)
   z = {k: jax.tree.map(jnp.zeros_like, v) for k, v in params["z"].items()}
   z["action"]["kernel"] = z["action"]["kernel"].at[0, 0].set(1.0).at[6, 0].set(5.0)
@@ -216,11 +218,11 @@ def test_greedy_takes_the_best_candidate(agent, state):
   assert any(np.any(info["q"] < info["q_max"]) for _, info in drawn)
 
 
-def test_limit_that_the_samples_cannot_reach_is_refused():
+def test_a_limit_that_the_samples_cannot_reach_is_rejected():
   with pytest.raises(ConfigError, match="epsilon"):
     make_agent(dataclasses.replace(CONFIG, epsilon=float(np.log(12)) + 1e-6))
 
 
-def test_unknown_algorithm_names_the_valid_ones():
+def test_the_error_for_an_unknown_algorithm_names_the_valid_ones():
   with pytest.raises(ConfigError, match=", ".join(ALGORITHMS)):
     make_agent(dataclasses.replace(CONFIG, algorithm="dqn"))

@@ -1,4 +1,4 @@
-"""The learner with an LSTM: it remembers what is no longer to be seen."""
+"""Learner with an LSTM: it remembers what earlier instants showed."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ CONFIG = AgentConfig(
 )
 
 
-def called(function: Callable, *args: Any) -> Any:
-  """What it returns for these arguments; compiled in a hurry, as it is called once."""
+def call(function: Callable, *args: Any) -> Any:
+  """Returns the result of ``function``, compiled without optimization for one call."""
   lowered: Any = jax.jit(function).lower(*args)
   return lowered.compile(compiler_options=testing.FAST_COMPILE)(*args)
 
 
 def episodes(steps: int = 64, worlds: int = 16) -> Replay:
-  """Episodes of four instants. What is to be done in all is shown in the first one."""
+  """Returns episodes of four instants, whose first shows the labels of all four."""
   rng = np.random.default_rng(0)
   cue = rng.choice([-1.0, 1.0], (steps // 4, worlds)).astype(np.float32).repeat(4, 0)
   instant = np.broadcast_to(np.arange(steps)[:, None] % 4, cue.shape)
@@ -58,7 +58,7 @@ def episodes(steps: int = 64, worlds: int = 16) -> Replay:
 
 
 def error_after_learning(instants: int) -> float:
-  """Of the primitives' velocities, rad/s, over the last of 400 updates."""
+  """Returns the error of the primitives (rad/s) over the last 20 of 400 updates."""
   agent = make_agent(dataclasses.replace(CONFIG, lstm_instants=instants))
   ring = episodes()
   draw = functools.partial(
@@ -72,28 +72,28 @@ def error_after_learning(instants: int) -> float:
     state = agent.init(key, draw(key).observation_tm1)
     return jax.lax.scan(update, state, jax.random.split(key, 400))[1]
 
-  metrics = called(learn, jax.random.key(0))
+  metrics = call(learn, jax.random.key(0))
   assert all(np.isfinite(x).all() for x in metrics.values())
   return float(metrics["ap/error"][-20:].mean())
 
 
-def test_only_with_an_lstm_an_earlier_instant_tells_what_to_do():
+def test_only_an_lstm_remembers_what_the_first_instant_showed():
   assert error_after_learning(3) < 0.05
-  # Two of the three instants from which a transition starts show nothing; any guess
-  # is then off by 0.5 on average.
+  # Two of the three instants at which a transition starts show nothing, so that any
+  # guess there is off by 0.5 on average.
   assert error_after_learning(0) > 0.28
 
 
 def test_an_update_from_images_of_several_instants_trains_the_lstm():
-  """Values by Retrace, which looks at each instant of a window."""
+  """Retrace evaluates the networks at each instant of a window."""
   config = dataclasses.replace(
     CONFIG, lstm_instants=2, policy_evaluation="retrace", image_shift=2
   )
   agent = make_agent(config)
   batch = random_batch(0, 4, pixels=True, windows=3, instants=2)
   with jax.numpy_rank_promotion("raise"):
-    state = called(agent.init, jax.random.key(0), batch.observation_tm1)
-    after, metrics = called(agent.update, state, batch, jax.random.key(1))
+    state = call(agent.init, jax.random.key(0), batch.observation_tm1)
+    after, metrics = call(agent.update, state, batch, jax.random.key(1))
   assert all(np.isfinite(x) for x in metrics.values())
   moved = jax.tree.map(
     lambda a, b: np.any(a != b), after.params["encoder"], state.params["encoder"]

@@ -1,4 +1,4 @@
-"""Targets of the values: Retrace against rlax and a loop, windows, double Q."""
+"""Value targets: Retrace compared with rlax and a loop, windows, double Q."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_retrace_target_matches_rlax():
   ours = losses.retrace_target(
     reward, discount, value, q, jnp.minimum(jnp.exp(ratio), 1.0)
   )
-  q_tm1 = random_array(5, BATCH, N)  # Only the first one counts, and cancels.
+  q_tm1 = random_array(5, BATCH, N)  # Only the first one matters, and it cancels.
   q_tm1 = q_tm1.at[:, 1:].set(q[:, :-1])
   error: Any = jax.vmap(rlax.retrace_continuous, (0, 0, 0, 0, 0, 0, None))(
     q_tm1, q[:, :-1], value, reward, discount, ratio[:, :-1], 1.0
@@ -44,7 +44,7 @@ def test_retrace_target_matches_rlax():
 
 
 def test_retrace_without_correction_is_the_n_step_return():
-  """Traces of one, and values of taken actions equal to the state's."""
+  """All traces are one, and the values of actions equal those of their states."""
   reward, value = random_array(0, BATCH, N), random_array(1, BATCH, N)
   discount = jnp.full((BATCH, N), 0.9)
   ours = losses.retrace_target(reward, discount, value, value, jnp.ones((BATCH, N)))
@@ -53,7 +53,7 @@ def test_retrace_without_correction_is_the_n_step_return():
 
 
 def agent_with(algorithm: str, evaluation: str):
-  """Agent, its row, and untrained parameters with a head that is not flat."""
+  """Returns the agent, its row, and parameters whose values depend on the action."""
   config = dataclasses.replace(
     CONFIG, algorithm=algorithm, policy_evaluation=evaluation
   )
@@ -64,14 +64,14 @@ def agent_with(algorithm: str, evaluation: str):
   return agent, algorithm_of(config), params
 
 
-def test_retrace_is_refused_where_the_policy_has_no_density():
+def test_retrace_is_rejected_for_a_policy_without_density():
   with pytest.raises(ConfigError, match="ap_cem"):
     agent_with("ap_cem", "retrace")
 
 
 @pytest.mark.parametrize("algorithm", ["svg_prior", "ap_npql"])
 def test_retrace_over_windows_is_the_sum_over_its_definition(algorithm: str):
-  """Munos et al., Eq. 4, forwards and one window after the other."""
+  """Sums Munos et al., Eq. 4, forward in time for one window after the other."""
   agent, row, params = agent_with(algorithm, "retrace")
   batch = random_batch(3, BATCH, windows=N)
   key = jax.random.key(1)

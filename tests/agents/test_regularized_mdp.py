@@ -1,8 +1,8 @@
-"""Theorem III.1 by enumeration: a small MDP whose actions can all be weighed.
+"""Theorem III.1 by enumeration: a small MDP in which all actions are candidates.
 
 The candidates of every state are its actions, repeated in proportion to b, so that the
 sample means of ``dists/boltzmann`` are the exact expectations over b. alpha(s) is found
-by bisection on the slope of ``alpha_loss``, returns are backed up by ``value_target``.
+by bisection on the slope of ``alpha_loss``; ``value_target`` backs up the returns.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ STATES, ACTIONS, COPIES = 5, 4, 12
 GAMMA = 0.8
 EPSILON = 0.4
 ATOMS = categorical.support(v_min=0.0, v_max=5.0, num_atoms=101)
-"""From the smallest to the largest return, so that no backup leaves them."""
+"""Atoms from the smallest to the largest return, so that no backup leaves them."""
 
 
 @pytest.fixture(scope="module")
 def mdp():
-  """Rewards [S, A], transitions [S, A, S], and which action each candidate copies."""
+  """Returns rewards [S, A], transitions [S, A, S] and candidates' actions [S, C]."""
   rng = np.random.default_rng(0)
   reward = rng.random((STATES, ACTIONS)).astype(np.float32)
   move = rng.dirichlet(np.ones(STATES), (STATES, ACTIONS)).astype(np.float32)
@@ -38,7 +38,7 @@ def mdp():
 
 @jax.jit
 def weigh(values: jax.Array) -> jax.Array:
-  """Importance weights of candidates [C, S] at the alpha(s) of the least dual."""
+  """Returns the weights of candidates [C, S] at the minimum of the dual."""
   slope = jax.grad(
     lambda alpha: jnp.sum(losses.alpha_loss(values, alpha, epsilon=EPSILON))
   )
@@ -54,17 +54,17 @@ def weigh(values: jax.Array) -> jax.Array:
 
 
 def weigh_without_limit(values: jax.Array) -> jax.Array:
-  """The same at one temperature, whatever the values."""
+  """Returns the weights of candidates [C, S] at a fixed temperature."""
   return boltzmann.importance_weights(values, jnp.full(STATES, 0.5))
 
 
 def candidates(q, copies):
-  """Values f32[C, S] of the candidates."""
+  """Returns the values f32[C, S] of the candidates."""
   return jnp.take_along_axis(jnp.asarray(q), copies, axis=1).T
 
 
 def improved(q, copies):
-  """q(a | s) of Eq. 6 with alpha(s) of Eq. 7: probabilities [S, A]."""
+  """Returns the probabilities q(a | s) [S, A] of Eq. 6 with alpha(s) of Eq. 7."""
   weights = np.asarray(weigh(candidates(q, copies))).T
   pairs = zip(copies, weights, strict=True)
   return np.stack([np.bincount(c, w, minlength=ACTIONS) for c, w in pairs])
@@ -72,7 +72,7 @@ def improved(q, copies):
 
 @jax.jit
 def operator(probs, mdp):
-  """T of Eq. 4 on return distributions [S, A, n], as Eq. 8 backs them up."""
+  """Applies T of Eq. 4 to return distributions [S, A, n] by the backup of Eq. 8."""
   reward, move, copies = mdp
   weights = weigh(candidates(probs @ ATOMS, copies))
   logits = jnp.log(jnp.take_along_axis(probs, copies[..., None], axis=1))
@@ -91,9 +91,9 @@ def operator(probs, mdp):
 
 
 def worst_ratio(weigh: Callable[[jax.Array], jax.Array], mdp) -> float:
-  """The largest |TQ - TQ'| / |Q - Q'| that random ascents on it find (maximum norm).
+  """Returns the largest |TQ - TQ'| / |Q - Q'| (maximum norm) of many random ascents.
 
-  On the means: the backup of a distribution has no other, as the first test shows.
+  They run on scalar values: the first test shows that T acts on the means alone.
   """
   _, move, copies = mdp
 
@@ -126,7 +126,7 @@ def worst_ratio(weigh: Callable[[jax.Array], jax.Array], mdp) -> float:
 
 
 def best_value(q, prior):
-  """max_pi E_pi[q] s.t. KL(pi || prior) <= EPSILON, by a general constrained solver."""
+  """Returns max_pi E_pi[q] s.t. KL(pi || prior) <= EPSILON, by scipy's solver."""
 
   def kl(pi):
     return np.sum(pi * np.log(np.maximum(pi, 1e-12) / prior))
@@ -145,6 +145,7 @@ def best_value(q, prior):
 
 
 def prior_of(copies):
+  """Returns b(a | s), the share of each action among the candidates."""
   return np.stack([np.bincount(c, minlength=ACTIONS) for c in copies]) / COPIES
 
 
@@ -159,7 +160,7 @@ def test_backup_of_a_distribution_has_the_mean_of_the_scalar_one(mdp):
 
 
 def test_improvement_is_the_best_policy_within_the_limit(mdp):
-  """Eqs. 6 and 7 against a solver that knows neither."""
+  """Eqs. 6 and 7 agree with a solver that uses neither."""
   _, _, copies = mdp
   q = np.random.default_rng(1).random((STATES, ACTIONS)).astype(np.float32)
   values = np.sum(improved(q, copies) * q, axis=1)
@@ -172,8 +173,11 @@ def test_operator_contracts_with_gamma_and_not_faster(mdp):
 
 
 def test_without_the_limit_the_operator_need_not_contract(mdp):
-  """It is the limit that makes E_q[Q] a maximum over policies, which no value can
-  raise by more than its own change; at a given temperature E_q[Q] is none."""
+  """Only with the limit is E_q[Q] a maximum over a fixed set of policies.
+
+  Such a maximum changes by no more than the values do. At a fixed temperature E_q[Q] is
+  no maximum.
+  """
   assert worst_ratio(weigh_without_limit, mdp) > 1.1 * GAMMA
 
 
@@ -188,14 +192,14 @@ def test_iteration_converges_to_the_optimum_of_the_constrained_problem(mdp):
     optimum = reward + GAMMA * move @ np.array(values)
   q = np.asarray(probs @ ATOMS)
   np.testing.assert_allclose(q, optimum, atol=5e-3)
-  # The policy found is worth what its value says: J of Eq. 1, by a linear solve.
+  # The value of the policy equals its return J of Eq. 1, from a linear solve.
   pi = improved(q, copies)
   chain = np.einsum("sa,sat->st", pi, move)
   worth = np.linalg.solve(np.eye(STATES) - GAMMA * chain, np.sum(pi * reward, axis=1))
   np.testing.assert_allclose(worth, np.sum(pi * q, axis=1), atol=5e-3)
   kl = np.sum(pi * np.log(pi / prior), axis=1)
   np.testing.assert_allclose(kl, EPSILON, atol=1e-3)
-  # A policy drawn at random within the limit is worth less, from every state.
+  # A random policy within the limit has a lower return from every state.
   rng = np.random.default_rng(3)
   for _ in range(20):
     other = improved(rng.random((STATES, ACTIONS)).astype(np.float32), copies)

@@ -1,8 +1,9 @@
-"""The algorithms of the paper learn a manipulation task without physics.
+"""Learning of a manipulation task without physics, by all algorithms of the paper.
 
 A point in R^6 with a gripper must go to an object, close there, and carry it to a
-goal: reward +1 once, at most ten steps. Its action primitives are the paper's: towards
-the object, the goal and a neutral place. A quarter of each batch is an expert's.
+goal. The reward is +1 once; episodes have at most ten steps. The action primitives are
+the paper's: towards the object, the goal and a neutral place. A quarter of each batch
+comes from an expert.
 """
 
 from __future__ import annotations
@@ -42,19 +43,21 @@ CONFIG = AgentConfig(
 
 
 class World(struct.PyTreeNode):
+  """States of all worlds."""
+
   history: Array  # f32[W, 3, 7]: last positions and gripper, newest last
   places: Array  # f32[W, 3, 6]: object, goal, neutral
   holding: Array  # bool[W]
   success: Array  # bool[W]
   time: Array  # i32[W]
-  held: bool = struct.field(pytree_node=False, default=False)  # Begins in the hand.
+  held: bool = struct.field(pytree_node=False, default=False)  # Start with it.
 
   @property
   def point(self) -> Array:
     return self.history[:, -1, :6]
 
   def near(self, place: int) -> Array:
-    """True where the point is within reach of the place."""
+    """Returns true where the point is within reach of the place."""
     return jnp.linalg.norm(self.point - self.places[:, place], axis=-1) < RADIUS
 
   @property
@@ -96,7 +99,7 @@ def reset(key: Array, *, held: bool = False) -> World:
 
 
 def step(world: World, action: Array, key: Array) -> World:
-  """Grasps, then moves the point. Where the episode had ended, a new one begins."""
+  """Grasps, then moves the point; resets worlds whose episode has ended."""
   holding = (action[:, 6] > 0.5) & (world.holding | world.near(0))
   newest = jnp.concatenate([world.point + STEP * action[:, :6], action[:, 6:]], -1)
   moved = world.replace(
@@ -114,7 +117,7 @@ def step(world: World, action: Array, key: Array) -> World:
 
 
 def expert(world: World, key: Array) -> tuple[Array, Array]:
-  """Follows one primitive after the other, with noise."""
+  """Follows the primitives to object and goal, with noise."""
   close = world.holding | world.near(0)
   towards = world.timestep.primitives
   action = jnp.where(close[:, None], towards[:, 1], towards[:, 0])
@@ -145,14 +148,14 @@ def rollout(
 
 
 def success_rate(policy: Policy, key: Array, *, held: bool = False) -> Array:
-  """Share of the worlds solved in their first episode."""
+  """Returns the share of worlds solved in their first episode."""
   key_reset, key_play = jax.random.split(key)
   _, slots = rollout(policy, reset(key_reset, held=held), key_play, LIMIT + 1)
   return jnp.mean(jnp.any(slots.timestep.terminated, axis=0))
 
 
 def begin(agent: Agent, key: Array, *, held: bool):
-  """Learner, worlds, empty replay and the expert's replay."""
+  """Returns the learner's state, worlds, an empty replay and the expert's replay."""
   keys = jax.random.split(key, 3)
   world = reset(keys[0], held=held)
   state = agent.init(keys[1], world.timestep.observation)
@@ -163,7 +166,7 @@ def begin(agent: Agent, key: Array, *, held: bool):
 
 
 def train_step(agent: Agent, carry, key: Array):
-  """Two steps of all worlds, then four updates."""
+  """Takes two steps in all worlds, then four updates."""
   state, world, ring, demos = carry
   key_play, key_learn = jax.random.split(key)
   world, slots = rollout(learned(agent, state), world, key_play, 2)
@@ -187,8 +190,8 @@ def train_step(agent: Agent, carry, key: Array):
   return (state, world, ring, demos), jax.tree.map(lambda x: x[-1], metrics)
 
 
-def test_expert_and_random_choice_frame_the_task():
-  """The task is solvable, and not by chance."""
+def test_the_expert_solves_the_task_and_random_choices_do_not():
+  """The random choices are among the primitives."""
 
   def random(world: World, key: Array) -> tuple[Array, Array]:
     arm, gripper = jax.random.split(key)
@@ -207,7 +210,7 @@ def test_expert_and_random_choice_frame_the_task():
 
 
 def learn(config: AgentConfig, iterations: int, *, held: bool = False):
-  """Success rates before and after training, and the metrics of each iteration."""
+  """Returns success rates before and after training, and metrics per iteration."""
   agent = make_agent(config)
   key_begin, key_train, key_test = jax.random.split(jax.random.key(0), 3)
   carry = jax.jit(functools.partial(begin, agent, held=held))(key_begin)
@@ -231,7 +234,7 @@ def test_agent_learns_to_carry_the_object_to_the_goal():
   before, after, metrics = learn(CONFIG, 700)
   assert before < 0.1
   assert after > 0.9
-  # It was the algorithm, not only the primitives: the KL limit is in force.
+  # The KL limit is active, so the primitives alone do not explain the success.
   assert jnp.mean(metrics["npql/kl_over_eps"][-50:]) > 0.7
 
 
@@ -246,7 +249,7 @@ SLOW = [("abm_mpo", 1.5), ("svg_prior", 6.0), ("mpo", 1.5), ("ap_cem", 1.5)]
   ],
 )
 def test_every_algorithm_of_the_paper_learns_half_of_the_task(algorithm, epsilon):
-  """The object is in the hand from the start: keep it, and find the goal."""
+  """The object starts in the hand; the agent must hold it and reach the goal."""
   config = dataclasses.replace(
     CONFIG,
     algorithm=algorithm,
@@ -258,7 +261,7 @@ def test_every_algorithm_of_the_paper_learns_half_of_the_task(algorithm, epsilon
     num_atoms=21,
     learning_rate_alpha=3e-4,
   )
-  # Without a prior of its own MPO begins far from the primitives.
+  # MPO has no prior around the primitives, so it starts far from them.
   before, after, _ = learn(config, 400 if algorithm == "mpo" else 200, held=True)
   assert before < 0.1
   assert after > 0.8

@@ -1,1 +1,1 @@
-"""The columns of Table I; one file each, and their shared candidates."""
+"""The columns of Table I, one file each, and the candidates that they share."""

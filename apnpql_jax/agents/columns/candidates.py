@@ -7,37 +7,39 @@ import math
 from flax import struct
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from apnpql_jax.dists.action import ActionDistribution
-from apnpql_jax.types import Array
 
 
 class Candidates(struct.PyTreeNode):
   """S candidate actions per state and the policy's weights on them."""
 
-  samples: Array  # f32[S, *b, 7]: as drawn, where densities are evaluated
-  actions: Array  # f32[S, *b, 7]: clipped to the action box, where Q is evaluated
-  outputs: Array  # f32[S, *b, n]: of the value head
-  q_values: Array  # f32[S, *b]
-  weights: Array  # f32[S, *b]: sum to one over S
-  base: ActionDistribution  # [*b]: the policy is base exp(tilt Q), normalized
-  tilt: Array  # f32[*b]: 1 / alpha, or zero where the policy is ``base`` itself
+  samples: Float[Array, " s *b 7"]  # as drawn, where densities are evaluated
+  actions: Float[Array, " s *b 7"]  # clipped to the action box, where Q is evaluated
+  outputs: Float[Array, " s *b n"]  # of the value head
+  q_values: Float[Array, " s *b"]
+  weights: Float[Array, " s *b"]  # sum to one over S
+  base: ActionDistribution  # [*b]; the policy is base exp(tilt Q), normalized
+  tilt: Float[Array, "*b"]  # 1 / alpha, or zero where the policy is ``base`` itself
 
   @property
-  def value(self) -> Array:
-    """E[Q] under the policy, f32[*b]."""
+  def value(self) -> Float[Array, "*b"]:
+    """E[Q] under the policy."""
     return jnp.sum(self.weights * self.q_values, axis=0)
 
   @property
-  def entropy(self) -> Array:
-    """Estimate of the policy's entropy in nats, f32[*b]."""
+  def entropy(self) -> Float[Array, "*b"]:
+    """Estimate of the policy's entropy in nats."""
     surprise = -self.log_prob(self.samples, self.q_values)
     return jnp.sum(self.weights * surprise, axis=0)
 
-  def log_prob(self, actions: Array, q_values: Array) -> Array:
-    """Log density of actions f32[T, *b, 7] with values f32[T, *b]: f32[T, *b].
+  def log_prob(
+    self, actions: Float[Array, " t *b 7"], q_values: Float[Array, " t *b"]
+  ) -> Float[Array, " t *b"]:
+    """Computes the log density of actions of the given values.
 
-    Of q it is an estimate: log b + Q / alpha - log mean_i exp(Q_i / alpha).
+    For q this is an estimate: log b + Q / alpha - log mean_i exp(Q_i / alpha).
     """
     tilt = self.tilt[None]
     log_sum = jax.nn.logsumexp(tilt * self.q_values, axis=0, keepdims=True)
@@ -45,6 +47,6 @@ class Candidates(struct.PyTreeNode):
     return self.base.log_prob(actions) + tilt * q_values - log_mean
 
 
-def clip_action(actions: Array) -> Array:
-  """Limits joint velocities to [-1, 1] rad/s; the gripper, in {0, 1}, is unchanged."""
+def clip_action(actions: Float[Array, "*b 7"]) -> Float[Array, "*b 7"]:
+  """Clips joint velocities to [-1, 1] rad/s; leaves the gripper in {0, 1} unchanged."""
   return jnp.clip(actions, -1.0, 1.0)

@@ -1,18 +1,20 @@
-"""Policy evaluation (Table I, last column): what the value head is, and its target.
+"""Policy evaluation (Table I, last column): the value head and its target.
 
-All estimate E_pi of the return; no entropy enters the value (paper Sec. V-B). Each
-reads the N-step transition of the replay, so that TD(0) proper is ``n_step`` = 1.
+Every target estimates E_pi of the return, without entropy (paper Sec. V-B), from the
+N-step transition of the replay. TD(0) proper is therefore ``n_step`` = 1.
 """
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Callable, Sequence
 import dataclasses
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 from flax import linen as nn
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 import numpy as np
 
 from apnpql_jax.agents import losses
@@ -24,132 +26,125 @@ from apnpql_jax.dists import categorical
 from apnpql_jax.types import Array, Observation, Transition
 
 TargetPolicy = Callable[[Observation], tuple[Heads, Candidates]]
-"""The target network's heads and its policy at any states."""
-
-
-class Evaluation(Protocol):
-  """How values are represented and learnt."""
-
-  windows: ClassVar[bool]
-  """True if the target needs all N instants of a transition (``Transition.window``)."""
-
-  def head(self, hidden: Sequence[int]) -> nn.Module:
-    """The value head, (phi f32[*b, m], actions f32[S, *b, 7]) -> f32[S, *b, n]."""
-    ...
-
-  def value(self, outputs: Array) -> Array:
-    """Q: f32[*b, n] -> f32[*b]."""
-    ...
-
-  def target(self, look: TargetPolicy, batch: Transition) -> Array:
-    """What ``loss`` compares outputs to: f32[B] or f32[B, n], without gradient."""
-    ...
-
-  def loss(self, outputs: Array, target: Array) -> Array:
-    """L^Q: f32[B, n] and a target -> f32[B]."""
-    ...
-
-  def expected(self, target: Array) -> Array:
-    """Mean return of a target, f32[B]."""
-    ...
+"""Evaluates the target network's heads and its policy at given states."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Categorical:
-  """Distributional, on fixed atoms (paper Eq. 8)."""
+class Evaluation(abc.ABC):
+  """How values are represented and learned."""
 
   config: AgentConfig
+
   windows: ClassVar[bool] = False
+  """True if the target needs all N instants of a transition (``Transition.window``)."""
+
+  @abc.abstractmethod
+  def head(self, hidden: Sequence[int]) -> nn.Module:
+    """Builds the value head; see ``modules.ValueHead`` for its inputs and outputs."""
+
+  @abc.abstractmethod
+  def value(self, outputs: Float[Array, "*b n"]) -> Float[Array, "*b"]:
+    """Converts outputs of the value head to Q."""
+
+  @abc.abstractmethod
+  def target(self, policy_at: TargetPolicy, batch: Transition) -> Float[Array, " B *n"]:
+    """Computes the target of the outputs, without gradient."""
+
+  @abc.abstractmethod
+  def loss(
+    self, outputs: Float[Array, "B n"], target: Float[Array, " B *n"]
+  ) -> Float[Array, " B"]:
+    """Computes L^Q."""
+
+  def expected(self, target: Float[Array, " B *n"]) -> Float[Array, " B"]:
+    """Returns the mean return of a target: by default the target itself."""
+    return target
+
+
+class Categorical(Evaluation):
+  """Return distributions on fixed atoms (paper Eq. 8)."""
 
   @property
-  def atoms(self) -> Array:
-    """Returns that the outputs are logits of, f32[num_atoms]."""
+  def atoms(self) -> Float[Array, " n"]:
+    """Support of the distributions."""
     config = self.config
     return categorical.support(
       v_min=config.v_min, v_max=config.v_max, num_atoms=config.num_atoms
     )
 
   def head(self, hidden: Sequence[int]) -> nn.Module:
-    """See ``Evaluation``."""
+    """Builds a head whose distribution starts broad with mean ``initial_value``."""
     config = self.config
     atoms = np.linspace(config.v_min, config.v_max, config.num_atoms)
     initial = categorical.broadest_logits(config.initial_value, atoms)
     return ValueHead(hidden, tuple(initial))
 
   def value(self, outputs: Array) -> Array:
-    """See ``Evaluation``."""
+    """Returns the mean of the distribution."""
     return categorical.mean(jax.nn.softmax(outputs), self.atoms)
 
-  def target(self, look: TargetPolicy, batch: Transition) -> Array:
-    """See ``Evaluation``."""
-    _, policy = look(batch.observation_t)
+  def target(self, policy_at: TargetPolicy, batch: Transition) -> Array:
+    """Projects the return distribution under the policy onto the atoms."""
+    _, policy = policy_at(batch.observation_t)
     return losses.value_target(
       policy.outputs, policy.weights, batch.reward_t, batch.discount_t, self.atoms
     )
 
   def loss(self, outputs: Array, target: Array) -> Array:
-    """See ``Evaluation``."""
+    """Computes the cross-entropy."""
     return losses.q_loss(outputs, target)
 
   def expected(self, target: Array) -> Array:
-    """See ``Evaluation``."""
+    """Returns the mean of the target distribution."""
     return categorical.mean(target, self.atoms)
 
 
-@dataclasses.dataclass(frozen=True)
-class TD0:
-  """One number, regressed on r + gamma E_pi[Q(s', a')]."""
-
-  config: AgentConfig
-  windows: ClassVar[bool] = False
+class TD0(Evaluation):
+  """A scalar value, regressed on r + gamma E_pi[Q(s', a')]."""
 
   def head(self, hidden: Sequence[int]) -> nn.Module:
-    """See ``Evaluation``."""
+    """Builds a head of one output that starts at ``initial_value``."""
     return ValueHead(hidden, (self.config.initial_value,))
 
   def value(self, outputs: Array) -> Array:
-    """See ``Evaluation``."""
+    """Returns the single output."""
     return outputs[..., 0]
 
-  def target(self, look: TargetPolicy, batch: Transition) -> Array:
-    """See ``Evaluation``."""
-    _, policy = look(batch.observation_t)
+  def target(self, policy_at: TargetPolicy, batch: Transition) -> Array:
+    """Bootstraps from the policy's value at s'."""
+    _, policy = policy_at(batch.observation_t)
     target = batch.reward_t + batch.discount_t * policy.value
     return jax.lax.stop_gradient(target)
 
   def loss(self, outputs: Array, target: Array) -> Array:
-    """See ``Evaluation``."""
+    """Computes half the squared error, summed over outputs."""
     return 0.5 * jnp.sum(jnp.square(outputs - target[..., None]), axis=-1)
-
-  def expected(self, target: Array) -> Array:
-    """See ``Evaluation``."""
-    return target
 
 
 class ClippedDoubleQ(TD0):
   """Two heads, regressed on one target with the smaller of both (Fujimoto 2018)."""
 
   def head(self, hidden: Sequence[int]) -> nn.Module:
-    """See ``Evaluation``."""
+    """Builds two heads of one output each."""
     return TwinValueHeads(hidden, (self.config.initial_value,) * 2)
 
   def value(self, outputs: Array) -> Array:
-    """See ``Evaluation``."""
+    """Returns the smaller output."""
     return jnp.min(outputs, axis=-1)
 
 
 class Retrace(TD0):
   """Off-policy corrected N-step returns, lambda = 1 (Munos 2016)."""
 
-  windows: ClassVar[bool] = True
+  windows = True
 
-  def target(self, look: TargetPolicy, batch: Transition) -> Array:
-    """See ``Evaluation``."""
+  def target(self, policy_at: TargetPolicy, batch: Transition) -> Array:
+    """Corrects the return of the window with importance ratios of at most one."""
     window = batch.window
     if window is None:
       raise ValueError("Retrace needs transitions with a window")
     step = window.timestep
-    heads, policy = look(step.observation)
+    heads, policy = policy_at(step.observation)
     actions = window.action[None]
     q_t = heads.q(actions)
     ratio = jnp.exp(policy.log_prob(actions, q_t)[0] - window.log_prob)

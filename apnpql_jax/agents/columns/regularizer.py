@@ -1,12 +1,11 @@
-"""What the policy is kept close to, and how that is trained (Table I, columns
-"regularizer" and "regularizer update").
-"""
+"""Regularizers and their updates (Table I, "regularizer", "regularizer update")."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import jax
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from apnpql_jax.agents import losses
 from apnpql_jax.agents.columns.candidates import Candidates
@@ -14,32 +13,31 @@ from apnpql_jax.agents.columns.policy import parametric
 from apnpql_jax.agents.heads import Heads
 from apnpql_jax.dists.action import ActionDistribution, UniformBox
 from apnpql_jax.dists.gmm import GripperGMM
-from apnpql_jax.types import ARM_DOF, Array, Transition
+from apnpql_jax.types import ARM_DOF, Transition
 
-Losses = dict[str, Array]
-"""Name -> f32[*b]."""
+Losses = dict[str, Float[Array, "*b"]]
 
 
 def behavior_prior(heads: Heads, slow: Heads) -> GripperGMM:
-  """b_theta: mixture around the predicted action primitives (paper Sec. IV-A)."""
+  """Returns b_theta, a mixture around predicted action primitives (Sec. IV-A)."""
   del slow
   return heads.prior()
 
 
 def previous_policy(heads: Heads, slow: Heads) -> GripperGMM:
-  """pi_{k-1}: the parametric policy of the target network, the slow average of psi."""
+  """Returns pi_{k-1}, the policy of the target network, a slow average of psi."""
   del heads
   return slow.policy()
 
 
 def uniform(heads: Heads, slow: Heads) -> UniformBox:
-  """The same density for all actions in the box."""
+  """Returns the uniform distribution over the action box."""
   del slow
   return UniformBox(heads.phi.shape[:-1], ARM_DOF)
 
 
 def no_update(*_: Any) -> Losses:
-  """For regularizers without parameters of their own."""
+  """Returns no losses, for regularizers without parameters of their own."""
   return {}
 
 
@@ -48,10 +46,10 @@ def fit_candidates(
   prior: ActionDistribution,
   candidates: Candidates,
   batch: Transition,
-  key: Array,
-  nu: Array,
+  key: PRNGKeyArray,
+  nu: Float[Array, ""],
 ) -> Losses:
-  """min KL(q || b) or min KL(pi || b): whichever the candidates stand for (Eq. 9)."""
+  """Fits b to the policy of the candidates: min KL(q || b) or KL(pi || b) (Eq. 9)."""
   del batch, key
   return _fit(heads, prior, candidates.samples, candidates.weights, nu)
 
@@ -61,30 +59,30 @@ def fit_advantageous(
   prior: ActionDistribution,
   candidates: Candidates,
   batch: Transition,
-  key: Array,
-  nu: Array,
+  key: PRNGKeyArray,
+  nu: Float[Array, ""],
 ) -> Losses:
-  """The advantage-weighted behavior model (ABM, Siegel 2020): max 1[A >= 0] log b(a).
+  """Fits b to good replayed actions (ABM, Siegel 2020): max 1[A >= 0] log b(a).
 
-  a is the replayed action, A = Q(s, a) - E_pi[Q(s, .)].
+  The advantage is A = Q(s, a) - E_pi[Q(s, .)].
   """
   del candidates
   samples = batch.action_tm1[None]
   # Not the draws that the policy update takes with this key.
-  policy = parametric(
-    heads,
-    prior,
-    jax.random.fold_in(key, 1),
-    num_samples=heads.config.policy_samples,
-  )
+  key = jax.random.fold_in(key, 1)
+  policy = parametric(heads, prior, key, num_samples=heads.config.policy_samples)
   good = heads.q(samples) >= policy.value[None]
   return _fit(heads, prior, samples, good.astype(samples.dtype), nu)
 
 
 def _fit(
-  heads: Heads, prior: ActionDistribution, samples: Array, weights: Array, nu: Array
+  heads: Heads,
+  prior: ActionDistribution,
+  samples: Float[Array, " s *b 7"],
+  weights: Float[Array, " s *b"],
+  nu: Float[Array, ""],
 ) -> Losses:
-  """M-step and dual of the entropy floor."""
+  """Returns the M-step's loss and the dual of the entropy floor."""
   return {
     "loss/m": losses.m_step_loss(prior, samples, weights, nu),
     "loss/nu": losses.nu_loss(
