@@ -1,4 +1,4 @@
-"""Videos of episodes: the whole robot beside what both cameras see."""
+"""Videos of episodes: a view of the whole robot next to both camera images."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from apnpql_jax.render.video import GREEN, RED, add_border, tile, write_video
 from apnpql_jax.rollout import Episodes
 
 VIEW_SIZE = (506, 674)
-"""Height and width of the view of the robot in pixels; both cameras fit beside it, the
-global one enlarged four times and that on the wrist six times."""
+"""Height and width of the view of the robot in pixels; both camera images fit next to
+it, the global one enlarged four times and the wrist one six times."""
 
 HOLD = 4
-"""Frames for which the last instant of an episode stays, framed in green or red."""
+"""Frames that show the last instant of an episode, framed in green or red."""
 
 
 def record_episodes(env: Env, played: Episodes, path: Path) -> Path:
-  """Writes episodes one after another as one video.
+  """Writes the first episodes, one after another, as one video.
 
   Args:
-    env: the worlds in which they were played.
-    played: the episodes, of which the first are filmed.
-    path: of the file to write; its folder is made.
+    env: the environment in which they were played.
+    played: the episodes.
+    path: file to write; its folder is created.
 
   Returns:
-    the path that was written, see ``write_video``.
+    The path that was written, see ``write_video``.
   """
   frames = np.concatenate(film(env, played))
   path.parent.mkdir(parents=True, exist_ok=True)
@@ -37,12 +37,15 @@ def record_episodes(env: Env, played: Episodes, path: Path) -> Path:
 
 
 def film(env: Env, played: Episodes) -> list[np.ndarray]:
-  """The first episodes; u8[T, H, W, 3] each, from the first to the last instant, which
-  is framed in green if the task was solved and in red if not.
+  """Renders the first episodes.
 
   Args:
-    env: the worlds in which they were played.
+    env: the environment in which they were played.
     played: the episodes.
+
+  Returns:
+    u8[T, H, W, 3] for each episode. Its last instant is framed in green if the task
+    was solved and in red otherwise.
   """
   sizes = (
     ("wide", VIEW_SIZE),
@@ -53,7 +56,7 @@ def film(env: Env, played: Episodes) -> list[np.ndarray]:
   draw = jax.jit(lambda physics: [env.view(camera, physics) for camera in cameras])
   episodes = []
   for episode in range(played.states.time.shape[1]):
-    # What comes later was never reached; drawn all the same, one program serves all.
+    # Instants after the end are drawn too, so that one compiled program serves all.
     instants = int(played.length[episode]) + 1
     physics = jax.tree.map(lambda x: x[:, episode], played.states)  # noqa: B023
     frames = tile([np.asarray(view)[:instants] for view in draw(physics)])

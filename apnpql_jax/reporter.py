@@ -1,4 +1,4 @@
-"""What a run tells while it trains: metrics, progress, evaluations, curve and video."""
+"""Output of a training run: metrics, progress, evaluations, curve and video."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from apnpql_jax.rollout import agent_policy, make_player
 from apnpql_jax.run_folder import RunFolder
 
 EVAL_SEED = 1
-"""Evaluations during training always play the same held-out episodes."""
+"""Seed of evaluations during training, which always play the same episodes."""
 
 
 class Silent:
-  """The reporter of processes that leave it to the first one."""
+  """Reporter without output, for all processes other than the first."""
 
   def __init__(self, folder: RunFolder):
-    """Nothing will be written into the folder."""
+    """Stores the folder; nothing is written into it."""
     self.folder = folder
     self.evaluation: dict[str, Any] = {}
 
@@ -42,7 +42,7 @@ class Silent:
 
 
 class Reporter:
-  """Metrics, progress, evaluation, curve and videos of a run."""
+  """Reporter that writes metrics, progress, evaluations, the curve and videos."""
 
   def __init__(
     self,
@@ -53,7 +53,7 @@ class Reporter:
     writer: MetricWriter,
     progress: TrainProgress,
   ):
-    """Builds the player of evaluations; nothing is compiled yet."""
+    """Builds the player for evaluations without compiling it."""
     self._config, self._env, self.folder = config, env, folder
     self._writer, self._progress = writer, progress
     self._play = make_player(
@@ -63,7 +63,7 @@ class Reporter:
     self.evaluation: dict[str, Any] = {}
 
   def iteration(self, step: int, updates: int, metrics: dict[str, Any]) -> None:
-    """Writes the row of one iteration; blocks until it has been computed."""
+    """Writes the row of one iteration; blocks until its metrics are computed."""
     metrics = jax.device_get(metrics)
     now = time.monotonic()
     seconds, self._lap = now - self._lap, now
@@ -79,7 +79,16 @@ class Reporter:
     self._writer.write(step, figures)
 
   def evaluate(self, step: int, state: TrainState, *, last: bool) -> float:
-    """Plays held-out episodes, writes their row, the curve and, at last, a video."""
+    """Plays held-out episodes; writes their row and the curve.
+
+    Args:
+      step: environment steps done.
+      state: its target networks act.
+      last: whether the run ends here; then a video is written too, if configured.
+
+    Returns:
+      The success rate in [0, 1].
+    """
     began = time.monotonic()
     config, folder = self._config, self.folder
     params = sharding.local(state.learner.target_params)

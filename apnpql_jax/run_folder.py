@@ -1,6 +1,6 @@
-"""What a run folder holds: its layout, and the record of what the run was made with.
+"""Run folder: its layout, and the record of the versions that made the run.
 
-Naming, refusing and replacing folders is the work of ``runs``.
+Module ``runs`` names, rejects and replaces folders.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class RunFolder:
 
   @property
   def versions(self) -> Path:
-    """What the run was made with, see ``describe_versions``."""
+    """Software and devices of the run, see ``describe_versions``."""
     return self.path / "versions.json"
 
   @property
@@ -46,44 +46,44 @@ class RunFolder:
 
   @property
   def curve(self) -> Path:
-    """Success rate over steps and time."""
+    """Plot of the success rate over steps and time."""
     return self.path / "curve.png"
 
   @property
   def videos(self) -> Path:
-    """Folder of evaluation videos; made by whoever writes the first one."""
+    """Folder of evaluation videos, created with the first one."""
     return self.path / "videos"
 
   @property
   def faults(self) -> Path:
-    """Folder of updates that were not finite, see ``faults``."""
+    """Folder of recorded updates that were not finite, see ``faults``."""
     return self.path / "faults"
 
 
 def create(
   run_dir: Path, config: TrainConfig, *, overwrite: bool = False, devices: int = 1
 ) -> RunFolder:
-  """Makes the folder and writes ``config.json`` and ``versions.json`` into it.
+  """Creates the folder with ``config.json`` and ``versions.json``.
 
   Raises:
-    ConfigError: it holds a run and ``overwrite`` is not set, or something that is no
-      run, which is never removed; or it cannot be made.
+    ConfigError: the folder holds a run and ``overwrite`` is not set, it holds something
+      other than a run, which is never removed, or it cannot be created.
   """
   runs.check_free(run_dir, overwrite=overwrite)
   versions = json.dumps(describe_versions(devices), indent=2) + "\n"
   with runs.fresh_run_dir(run_dir) as path:
     folder = RunFolder(path=path, config=config)
     write_text(folder.versions, versions)
-    # Last, because its presence says that this is a run.
+    # Last, because this file marks the folder as a run.
     write_text(path / runs.CONFIG_FILE, config_to_json(config))
   return folder
 
 
 def open_run(run_dir: Path) -> RunFolder:
-  """An existing run, to resume or to evaluate.
+  """Opens an existing run to resume or evaluate it.
 
   Raises:
-    ConfigError: it is not a run folder, its configuration cannot be read, or links
+    ConfigError: the folder is not a run, its configuration cannot be read, or links
       lead out of it.
   """
   runs.check_contained(run_dir)
@@ -91,10 +91,10 @@ def open_run(run_dir: Path) -> RunFolder:
 
 
 def changed_versions(folder: RunFolder, *, devices: int = 1) -> list[str]:
-  """What differs between the record of a run and now, such as ``jax 0.9.1 -> 0.10.2``.
+  """Returns changes since the run was created, such as ``jax 0.9.1 -> 0.10.2``.
 
-  A run resumed with other versions or another device learns on, but not bit by bit as
-  it would have; without a readable record, that is the one line.
+  A run resumed with other versions or another device continues, but its numbers differ
+  from those of an uninterrupted run. An unreadable record gives one line of its own.
   """
   try:
     old = _flat(json.loads(folder.versions.read_text(encoding="utf-8")))
@@ -110,7 +110,7 @@ def changed_versions(folder: RunFolder, *, devices: int = 1) -> list[str]:
 
 
 def describe_versions(devices: int) -> dict[str, Any]:
-  """Versions of Python and the packages, git commit of a checkout, devices, time."""
+  """Returns versions of Python and packages, the git commit, devices and the time."""
   import jax  # Here, so that naming a run folder does not start JAX.
 
   return {
@@ -128,7 +128,7 @@ def describe_versions(devices: int) -> dict[str, Any]:
 
 
 def write_text(path: Path, text: str) -> None:
-  """Writes a file whole or not at all, so that a killed run leaves no half of one."""
+  """Writes a file atomically, so that a killed run leaves no partial file."""
   part = path.with_name(path.name + ".part")
   part.write_text(text, encoding="utf-8")
   os.replace(part, path)
@@ -142,7 +142,7 @@ def _version(package: str) -> str | None:
 
 
 def _git(package_dir: Path) -> dict[str, Any] | None:
-  """Commit and whether tracked files differ from it; None outside of a checkout."""
+  """Returns the commit and whether files differ from it; None outside a checkout."""
 
   def git(*args: str) -> str:
     command = ["git", "-C", str(package_dir), *args]
@@ -151,7 +151,7 @@ def _git(package_dir: Path) -> dict[str, Any] | None:
     ).stdout.strip()
 
   try:
-    # An installed package may lie inside somebody else's repository.
+    # An installed package may lie inside an unrelated repository.
     git("ls-files", "--error-unmatch", "__init__.py")
     changes = git("status", "--porcelain", "--untracked-files=no")
     return {"commit": git("rev-parse", "HEAD"), "dirty": bool(changes)}
