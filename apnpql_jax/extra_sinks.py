@@ -32,7 +32,7 @@ class TensorboardSink:
 
 
 class WandbSink:
-  """Sink to a run of the project ``apnpql_jax`` named after the folder (``wandb``)."""
+  """Sink to a Weights & Biases run named after the folder (extra ``wandb``)."""
 
   def __init__(self, run_dir: Path, config: Mapping[str, Any]):
     """Starts the run with ``config`` as its settings."""
