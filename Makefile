@@ -1,6 +1,7 @@
 # make train   train on push_plate from pixels (options: PRESET=..., RUN=..., ARGS=...)
 # make test    run the tests
-# make lint    style and types
+# make lint    style, types and spelling
+# make docs    build the site in build/site
 # make cuda    add the GPU builds of JAX and MJX-Warp to the environment
 # make clean   remove the environment and caches; runs are kept
 #
@@ -15,7 +16,7 @@ RUN ?=
 ARGS ?=
 PYTEST_ARGS ?=
 
-.PHONY: train test lint cuda clean
+.PHONY: train test lint docs cuda clean
 .DELETE_ON_ERROR:
 
 train: $(VENV)/.runtime
@@ -28,6 +29,10 @@ lint: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/ty check --python $(VENV)
+	$(BIN)/codespell
+
+docs: $(VENV)/.docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 cuda: $(VENV)/.runtime
 	$(PIP) install --no-build-isolation --constraint requirements.lock -e '.[cuda]'
@@ -44,6 +49,11 @@ $(VENV)/.runtime: requirements.lock pyproject.toml | $(VENV)/.python
 
 $(VENV)/.dev: requirements-dev.lock $(VENV)/.runtime
 	$(PIP) install --quiet --no-deps --requirement requirements-dev.lock
+	@touch $@
+
+# The site is made from the sources as text, so it needs nothing but its own lock.
+$(VENV)/.docs: requirements-docs.lock | $(VENV)/.python
+	$(PIP) install --quiet --no-deps --requirement requirements-docs.lock
 	@touch $@
 
 # 3.11 first: it is the version the locks were made with.

@@ -1,11 +1,65 @@
-"""AP-NPQL on JAX and MuJoCo: pixels to policy with one command."""
+"""AP-NPQL on JAX and MuJoCo: pixels to policy with one command.
+
+The names below are the public API, imported on first use so that importing the package
+is fast. Programs call ``configure`` first.
+"""
 
 from __future__ import annotations
 
-from apnpql_jax import runtime
+import importlib
+from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from apnpql_jax.version import __version__ as __version__
 
-# Before anything else of the package: JAX reads these settings once, when its
-# backend starts.
-runtime.configure()
+if TYPE_CHECKING:
+  from apnpql_jax.agents.learner import Agent as Agent, make_agent as make_agent
+  from apnpql_jax.config.files import (
+    load_preset as load_preset,
+    preset_names as preset_names,
+  )
+  from apnpql_jax.config.ranges import RandomizationConfig as RandomizationConfig
+  from apnpql_jax.config.schema import (
+    AgentConfig as AgentConfig,
+    EnvConfig as EnvConfig,
+    ReplayConfig as ReplayConfig,
+    TrainConfig as TrainConfig,
+  )
+  from apnpql_jax.envs.env import Env as Env, make_env as make_env
+  from apnpql_jax.errors import (
+    ConfigError as ConfigError,
+    RunStopped as RunStopped,
+    UserError as UserError,
+  )
+  from apnpql_jax.runtime import configure as configure
+  from apnpql_jax.tasks.task import (
+    Task as Task,
+    make_task as make_task,
+    register_task as register_task,
+    task_names as task_names,
+  )
+  from apnpql_jax.training.evaluate import evaluate as evaluate
+  from apnpql_jax.training.train import train as train
+
+_MODULES = {
+  "agents.learner": ("Agent", "make_agent"),
+  "config.files": ("load_preset", "preset_names"),
+  "config.ranges": ("RandomizationConfig",),
+  "config.schema": ("AgentConfig", "EnvConfig", "ReplayConfig", "TrainConfig"),
+  "envs.env": ("Env", "make_env"),
+  "errors": ("ConfigError", "RunStopped", "UserError"),
+  "runtime": ("configure",),
+  "tasks.task": ("Task", "make_task", "register_task", "task_names"),
+  "training.evaluate": ("evaluate",),
+  "training.train": ("train",),
+}
+_HOME = {name: module for module, names in _MODULES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+  if name not in _HOME:
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+  return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+  return sorted({*globals(), *_HOME})

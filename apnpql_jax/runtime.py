@@ -1,8 +1,8 @@
-"""Process-wide settings that must be in place before JAX starts its backend.
+"""Process-wide settings that must precede the start of JAX's backend.
 
-Called once by ``import apnpql_jax``. Nothing here imports JAX: the settings go
-through the environment, and through ``jax.config`` where the caller imported JAX
-first. A value the user has set is kept, except for a thread count that can hang.
+They go through the environment, and through ``jax.config`` if JAX is already imported;
+this module does not import it. Values set by the user are kept, except for a thread
+count that can deadlock.
 """
 
 from __future__ import annotations
@@ -17,28 +17,29 @@ import re
 import sys
 
 MIN_THREADS = 4
-"""Smallest XLA:CPU thread pool in which two batched Cholesky calls cannot lock; the
-devices of a CPU that has been told to be several share one pool."""
-
-_DEFAULTS = {
-  # On a GPU, XLA multiplies f32 matrices in TF32 (10 bits of mantissa) unless told
-  # otherwise. Mass matrices and forward kinematics then lose three digits, and
-  # contacts with them. No effect on a CPU.
-  "jax_default_matmul_precision": "highest",
-}
+"""Smallest XLA:CPU thread pool per device in which two batched Cholesky calls cannot
+deadlock. Emulated devices of one CPU share a pool."""
 
 KEPT_FUSIONS = "INDIVIDUAL_CONVOLUTION", "INDIVIDUAL_DOT"
-"""What XLA:CPU hands over to the library YNNPACK. By default also "REDUCE"."""
+"""Operations that XLA:CPU runs in the library YNNPACK; its default adds "REDUCE"."""
 
 _FLAG, _FLAG_VERSIONS = "xla_cpu_experimental_ynn_fusion_type", r"0\.1[01]\."
-"""And the versions of jaxlib: XLA ends a process that names a flag it does not know."""
+"""The flag and the jaxlib versions that have it; XLA aborts on unknown flags."""
 
 
 def configure() -> None:
-  """Sets threads, flags, compilation cache and precision; safe to call again."""
+  """Sets threads, XLA flags, compilation cache and precision; idempotent.
+
+  Call this before JAX runs anything; the command line does.
+  """
   _set_threads()
-  _keep_sums()
-  defaults = dict(_DEFAULTS, jax_compilation_cache_dir=str(cache_dir() / "xla"))
+  _set_fusions()
+  defaults = {
+    "jax_compilation_cache_dir": str(cache_dir() / "xla"),
+    # By default XLA multiplies f32 matrices in TF32 (10 bits of mantissa) on GPUs. Mass
+    # matrices, forward kinematics and so contacts would lose three digits.
+    "jax_default_matmul_precision": "highest",
+  }
   for name, value in defaults.items():
     os.environ.setdefault(name.upper(), value)
     jax = sys.modules.get("jax")
@@ -47,7 +48,7 @@ def configure() -> None:
 
 
 def cache_dir() -> Path:
-  """The user's cache folder of this package; made by whoever writes into it."""
+  """Returns the user's cache folder of this package, which may not exist yet."""
   root = os.environ.get("XDG_CACHE_HOME", "")
   base = Path(root) if os.path.isabs(root) else Path.home() / ".cache"
   return base / "apnpql_jax"
@@ -55,10 +56,9 @@ def cache_dir() -> Path:
 
 @contextlib.contextmanager
 def quiet_warp() -> Generator[None, None, None]:
-  """Drops the lines MJX prints when it is imported without the optional Warp.
+  """Drops the lines that MJX prints when imported without the optional Warp.
 
-  They go to standard output and look like errors. Anything else printed inside is
-  passed on.
+  They go to standard output and look like errors. Other output passes through.
   """
   captured = io.StringIO()
   try:
@@ -71,25 +71,21 @@ def quiet_warp() -> Generator[None, None, None]:
 
 
 def _set_threads() -> None:
-  # The batched Cholesky of XLA:CPU waits inside a pool thread for other pool
-  # threads. With a pool of two, two such calls wait for each other for ever (seen
-  # from 128 worlds upwards); with four they do not. XLA sizes the pool from these
-  # variables, or from the number of cores.
-  least, pinned = MIN_THREADS * _cpu_devices(), False
-  for name in ("PJRT_NPROC", "NPROC"):
-    text = os.environ.get(name, "")
-    if text.isdigit():
-      pinned = True
-      if int(text) < least:
-        os.environ[name] = str(least)
-  if not pinned and cores() < least:
-    os.environ["NPROC"] = str(least)
+  # The batched Cholesky of XLA:CPU waits in a pool thread for other pool threads. In a
+  # pool of two, two such calls deadlock (seen from 128 worlds on); in a pool of four
+  # they do not. XLA sizes the pool by these variables or the number of cores.
+  minimum = MIN_THREADS * _cpu_devices()
+  given = [x for x in ("PJRT_NPROC", "NPROC") if os.environ.get(x, "").isdigit()]
+  for name in given:
+    os.environ[name] = str(max(minimum, int(os.environ[name])))
+  if not given and cores() < minimum:
+    os.environ["NPROC"] = str(minimum)
 
 
-def _keep_sums() -> None:
-  # The sums of MJX's line search are so small that handing them over takes longer than
-  # adding up: a step of physics then takes 1.3 to 1.8 times as long. Updates of the
-  # presets gain too, while those of batch 32 with 30 candidates lose 8 %.
+def _set_fusions() -> None:
+  # The sums of MJX's line search are too small for YNNPACK: with "REDUCE", a physics
+  # step takes 1.3 to 1.8 times as long. Updates of the presets become faster without it
+  # too; those with batch 32 and 30 candidates become 8 % slower.
   flags = os.environ.get("XLA_FLAGS", "")
   flag = fusions_flag(*KEPT_FUSIONS)
   if flag and _FLAG not in flags:
@@ -97,14 +93,14 @@ def _keep_sums() -> None:
 
 
 def fusions_flag(*kinds: str) -> str:
-  """The flag by which XLA:CPU hands over these alone; "" if it may not know it."""
+  """Returns the XLA flag that limits YNNPACK to these kinds; "" if unsupported."""
   if not re.match(_FLAG_VERSIONS, metadata.version("jaxlib")):
     return ""
   return f"--{_FLAG}=" + ",".join(f"LIBRARY_FUSION_TYPE_{kind}" for kind in kinds)
 
 
 def _cpu_devices() -> int:
-  """How many devices JAX is to take the CPU for; one if nobody has asked for more."""
+  """Returns the number of devices that JAX is set to emulate on the CPU."""
   flag = r"xla_force_host_platform_device_count=(\d+)"
   found = re.search(flag, os.environ.get("XLA_FLAGS", ""))
   text = found[1] if found else os.environ.get("JAX_NUM_CPU_DEVICES", "")
@@ -112,7 +108,7 @@ def _cpu_devices() -> int:
 
 
 def cores() -> int:
-  """CPU cores this process may use."""
+  """Returns the number of CPU cores this process may use."""
   if hasattr(os, "sched_getaffinity"):  # Not on macOS.
     return len(os.sched_getaffinity(0))
   return os.cpu_count() or 1

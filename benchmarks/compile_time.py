@@ -27,11 +27,11 @@ from typing import Any
 import timing  # isort: skip  (before JAX: sets threads and cache)
 import settings
 import tables
-import tiny
 
-from apnpql_jax.config import BACKENDS
-from apnpql_jax.presets import load_preset
-from apnpql_jax.primitives.bank import load_bank
+from apnpql_jax import testing
+from apnpql_jax.config.checks import BACKENDS
+from apnpql_jax.config.files import load_preset
+from apnpql_jax.primitives.reset_bank import load_bank
 from apnpql_jax.tasks import make_task, task_names
 
 PERIODS = 8
@@ -59,7 +59,7 @@ def measure_all(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
   import_seconds()  # From the disk.
   imports = [import_seconds() for _ in range(max(3, args.repeats))]
   for task, backend in itertools.product(args.tasks, args.backends):
-    options = tiny.PRESET_ARGS if args.quick else short(task)
+    options = testing.TINY_ARGS if args.quick else short(task)
     command = ["train", task, *options, "--backend", backend]
     starts = [cold_and_warm(command) for _ in range(args.repeats)]
     cold, warm = zip(*starts, strict=True)
@@ -100,7 +100,7 @@ def start(command: list[str], run: Path, env: dict[str, str]) -> float:
       stdout=file,
       stderr=file,
     )
-  while not tiny.rows(run):
+  while not testing.rows(run):
     if process.poll() is not None or time.monotonic() - began > PATIENCE_S:
       process.kill()
       raise RuntimeError(said.read_text(errors="replace")[-2000:])
@@ -116,7 +116,9 @@ def import_seconds() -> float:
   """Of a process that only imports what training needs."""
   began = time.monotonic()
   subprocess.run(
-    [sys.executable, "-c", "import apnpql_jax.train"], env=environment(), check=True
+    [sys.executable, "-c", "import apnpql_jax.training.train"],
+    env=environment(),
+    check=True,
   )
   return time.monotonic() - began
 

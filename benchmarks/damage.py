@@ -7,16 +7,20 @@ import random
 import shutil
 from typing import Any
 
+from apnpql_jax.runs import run_folder
+
 import apnpql_jax  # noqa: F401  isort: skip  (before JAX: sets threads and cache)
 
 import jax
 import jax.numpy as jnp
 
-from apnpql_jax import checkpoint, resuming, runs
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.checkpoint_writer import CheckpointWriter
-from apnpql_jax.env import make_env
-from apnpql_jax.iteration import empty_expert, initial_state
+from apnpql_jax.envs.env import make_env
+from apnpql_jax.runs import checkpoint_reader
+from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
+from apnpql_jax.training import resume
+from apnpql_jax.training.expert import empty_expert
+from apnpql_jax.training.state import initial_state
 
 
 def poison(run: Path, *, rewards: bool) -> None:
@@ -26,10 +30,10 @@ def poison(run: Path, *, rewards: bool) -> None:
     run: the run folder.
     rewards: into all of both replays; else into the velocity of one world.
   """
-  config = runs.load_run_config(run)
+  config = run_folder.load_run_config(run)
   env, agent = make_env(config.env), make_agent(config.agent)
   example = jax.eval_shape(lambda: initial_state(config, env, agent, empty_expert))
-  state = resuming.restore(config, run, example, lambda line: None)
+  state = resume.restore(config, run, example, lambda line: None)
   if rewards:
     state = state.replace(
       replay=_no_rewards(state.replay), expert_replay=_no_rewards(state.expert_replay)
@@ -40,12 +44,12 @@ def poison(run: Path, *, rewards: bool) -> None:
     state = state.replace(env=state.env.replace(physics=physics))
   shutil.rmtree(run / "checkpoints")
   with CheckpointWriter(run, config, keep=1) as writer:
-    writer.save(int(state.env_steps), resuming.to_items(state, whole=True))
+    writer.save(int(state.env_steps), resume.to_items(state, whole=True))
 
 
 def flip_a_bit(run: Path, rng: random.Random) -> str:
   """In the largest file of the newest checkpoint; returns its name."""
-  folder = run / "checkpoints" / str(checkpoint.latest_step(run))
+  folder = run / "checkpoints" / str(checkpoint_reader.latest_step(run))
   files = [path for path in folder.rglob("*") if path.is_file()]
   file = max(files, key=lambda path: path.stat().st_size)
   data = bytearray(file.read_bytes())

@@ -23,16 +23,16 @@ from flax import linen as nn
 import jax.numpy as jnp
 import learner
 import tables
-import tiny
 
+from apnpql_jax import testing
 from apnpql_jax.agents import encoder
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import AgentConfig
-from apnpql_jax.presets import load_preset
+from apnpql_jax.config.files import load_preset
+from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.types import Array
 
 sys.path.append(str(tables.ROOT / "tests"))
-from batches import random_batch  # noqa: E402  (the noise that the tests use)
+from apnpql_jax.testing import random_batch
 
 
 def main() -> None:
@@ -44,7 +44,7 @@ def main() -> None:
   args = timing.parse(parser)
   config = load_preset(args.preset).agent
   if args.quick:
-    args.batch, config = 8, tiny.CONFIG.agent
+    args.batch, config = 8, testing.TINY.agent
   header = {"preset": args.preset, "batch": args.batch}
   timing.publish("encoder_layouts", args, measure_all(config, args), **header)
 

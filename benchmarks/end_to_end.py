@@ -24,15 +24,12 @@ import parts
 import settings
 
 from apnpql_jax.agents.learner import Agent, make_agent
-from apnpql_jax.config import ConfigError, TrainConfig
-from apnpql_jax.env import make_env
-from apnpql_jax.iteration import (
-  TrainState,
-  empty_expert,
-  initial_state,
-  make_iteration,
-  make_sample,
-)
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.envs.env import make_env
+from apnpql_jax.errors import ConfigError
+from apnpql_jax.training.expert import empty_expert
+from apnpql_jax.training.iteration import make_iteration, make_sample
+from apnpql_jax.training.state import TrainState, initial_state
 
 
 def main() -> None:

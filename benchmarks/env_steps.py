@@ -23,10 +23,11 @@ import parts
 import settings
 
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import ConfigError, TrainConfig
-from apnpql_jax.env import Env, make_env
-from apnpql_jax.env_state import EnvState
-from apnpql_jax.rollout import Policy, agent_policy, rollout
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.envs.env import Env, make_env
+from apnpql_jax.envs.state import EnvState
+from apnpql_jax.errors import ConfigError
+from apnpql_jax.training.rollout import Policy, agent_policy, rollout
 
 
 def main() -> None:

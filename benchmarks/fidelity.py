@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 import tables
 
-from apnpql_jax.config import EnvConfig
+from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.render import CameraSpec, Geoms, Image, Lighting, render
 from apnpql_jax.tasks import Task, make_task, task_names
 

@@ -30,16 +30,18 @@ from ray_layouts import LAYOUTS, SIZES, Layout
 from render import make_pair, make_poses
 
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import EnvConfig
-from apnpql_jax.env import make_env
-from apnpql_jax.env_state import EnvState
-from apnpql_jax.iteration import empty_expert, initial_state, make_iteration
-from apnpql_jax.rollout import agent_policy, rollout
+from apnpql_jax.config.schema import EnvConfig
+from apnpql_jax.envs.env import make_env
+from apnpql_jax.envs.state import EnvState
 from apnpql_jax.tasks import make_task
+from apnpql_jax.training.expert import empty_expert
+from apnpql_jax.training.iteration import make_iteration
+from apnpql_jax.training.rollout import agent_policy, rollout
+from apnpql_jax.training.state import initial_state
 from apnpql_jax.types import Array, Transition
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
-from batches import random_batch  # noqa: E402  (the noise that the tests use)
+from apnpql_jax.testing import random_batch
 
 PRECISIONS = ("highest", "tensorfloat32")
 

@@ -14,17 +14,14 @@ import jax
 import jax.numpy as jnp
 
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import AgentConfig, TrainConfig
-from apnpql_jax.env import make_env
-from apnpql_jax.evaluate import figures_of, play_held_out
-from apnpql_jax.iteration import (
-  collect_expert,
-  empty_expert,
-  initial_state,
-  make_iteration,
-)
-from apnpql_jax.presets import load_preset
-from apnpql_jax.rollout import agent_policy, make_player
+from apnpql_jax.config.files import load_preset
+from apnpql_jax.config.schema import AgentConfig, TrainConfig
+from apnpql_jax.envs.env import make_env
+from apnpql_jax.training.evaluate import figures_of, play_held_out
+from apnpql_jax.training.expert import collect_expert, empty_expert
+from apnpql_jax.training.iteration import make_iteration
+from apnpql_jax.training.rollout import agent_policy, make_player
+from apnpql_jax.training.state import initial_state
 
 
 def agent_config(settings: Settings) -> AgentConfig:

@@ -18,6 +18,8 @@ import functools
 import sys
 from typing import Any
 
+from apnpql_jax import devices
+
 import timing  # isort: skip  (before JAX: sets threads and cache)
 import env_steps
 import floor
@@ -31,20 +33,22 @@ import parts
 import settings
 import tables
 
-from apnpql_jax import memory, replay
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import AgentConfig, ConfigError, EnvConfig, TrainConfig
-from apnpql_jax.contact_report import SUBSTEPS
-from apnpql_jax.env import make_env
-from apnpql_jax.iteration import example_slot
-from apnpql_jax.presets import load_preset, mjcf_path
-from apnpql_jax.sim.physics import initial_state, make_physics
+from apnpql_jax.config.files import load_preset, mjcf_path
+from apnpql_jax.config.schema import AgentConfig, EnvConfig, TrainConfig
+from apnpql_jax.data import replay
+from apnpql_jax.envs.contact_report import SUBSTEPS
+from apnpql_jax.envs.env import make_env
+from apnpql_jax.errors import ConfigError
+from apnpql_jax.sim.engines import make_physics
+from apnpql_jax.sim.physics import initial_state
 from apnpql_jax.sim.scene import Scene, load_scene
 from apnpql_jax.tasks import make_task
+from apnpql_jax.training.expert import example_slot
 from apnpql_jax.types import Observation
 
 sys.path.append(str(tables.ROOT / "tests"))
-from batches import random_batch  # noqa: E402  (the noise that the tests use)
+from apnpql_jax.testing import random_batch
 
 BATCH = 64
 WORLDS = 32
@@ -195,7 +199,7 @@ def _replay(config: TrainConfig, count: int) -> timing.Ready:
   )
   length = count // config.env.worlds
   need = floor.nbytes(jax.eval_shape(functools.partial(create, length=length)))
-  memory.check_memory(need, "the replay")
+  devices.check_memory(need, "the replay")
   ring = create(length=length).replace(size=jnp.full((), length))
   chunk = create(length=config.rollout_length).slots
   none = jnp.zeros(config.env.worlds, jnp.int32)

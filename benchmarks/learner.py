@@ -27,17 +27,18 @@ import floor
 import jax
 import jax.numpy as jnp
 import tables
-import tiny
 
+from apnpql_jax import testing
 from apnpql_jax.agents import learner
+from apnpql_jax.agents.heads import Heads, Networks, Params
 from apnpql_jax.agents.learner import Agent, make_agent
-from apnpql_jax.agents.networks import Heads, Networks, Params, make_networks
-from apnpql_jax.config import AgentConfig
-from apnpql_jax.presets import load_preset
+from apnpql_jax.agents.networks import make_networks
+from apnpql_jax.config.files import load_preset
+from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.types import Array, Observation, Transition
 
 sys.path.append(str(tables.ROOT / "tests"))
-from batches import random_batch  # noqa: E402  (the noise that the tests use)
+from apnpql_jax.testing import random_batch
 
 
 def main() -> None:
@@ -50,7 +51,7 @@ def main() -> None:
   args = timing.parse(parser)
   config = load_preset(args.preset).agent
   if args.quick:
-    args.batch, args.candidates, config = [8], [8], tiny.CONFIG.agent
+    args.batch, args.candidates, config = [8], [8], testing.TINY.agent
   if args.lstm_instants is not None:
     config = dataclasses.replace(config, lstm_instants=args.lstm_instants)
   header = {"preset": args.preset, "lstm_instants": config.lstm_instants}
@@ -150,7 +151,7 @@ def forgetful_agent(config: AgentConfig) -> Agent:
 
   def build(*args: Any) -> ForgetfulNetworks:
     networks = make_networks(*args)
-    return ForgetfulNetworks(networks.modules, networks.evaluation, networks.config)
+    return ForgetfulNetworks(networks.modules, networks.value, networks.config)
 
   with mock.patch.object(learner, "make_networks", build):
     return make_agent(config)

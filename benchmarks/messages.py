@@ -20,11 +20,14 @@ import apnpql_jax  # noqa: F401  isort: skip  (before JAX: sets threads and cach
 import jax
 import tables
 
-from apnpql_jax import leaves, sharding
+from apnpql_jax import devices
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.env import make_env
-from apnpql_jax.iteration import TrainState, example_state, make_sample, place
-from apnpql_jax.presets import load_preset
+from apnpql_jax.config.files import load_preset
+from apnpql_jax.envs.env import make_env
+from apnpql_jax.runs import leaves
+from apnpql_jax.training.iteration import make_sample
+from apnpql_jax.training.placement import place
+from apnpql_jax.training.state import TrainState, example_state
 
 _KINDS = "all-reduce|all-gather|all-to-all|collective-permute|reduce-scatter"
 _BYTES = {"pred": 1, "s8": 1, "u8": 1, "s32": 4, "u32": 4, "f32": 4}
@@ -52,7 +55,7 @@ def main() -> None:
 
 def measure(args: argparse.Namespace) -> dict[str, int]:
   """Bytes of what is sent, and of what it is made of."""
-  config, mesh = load_preset(args.preset), sharding.make_mesh(args.devices)
+  config, mesh = load_preset(args.preset), devices.make_mesh(args.devices)
   env = make_env(config.env, mesh, instants=config.agent.lstm_instants)
   agent = make_agent(config.agent)
   state = example_state(config, env, agent)

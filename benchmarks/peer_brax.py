@@ -23,8 +23,8 @@ import numpy as np
 import optax
 import sides
 
-from apnpql_jax.config import AgentConfig
-from apnpql_jax.presets import load_preset
+from apnpql_jax.config.files import load_preset
+from apnpql_jax.config.schema import AgentConfig
 
 ACTION_DIM = 7
 IMAGES = {"pixels/global": (72, 96), "pixels/wrist": (36, 64)}

@@ -24,15 +24,15 @@ import sides
 import tables
 
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import AgentConfig, EnvConfig
-from apnpql_jax.env import make_env
-from apnpql_jax.env_state import EnvState
-from apnpql_jax.presets import load_preset
-from apnpql_jax.rollout import rollout
+from apnpql_jax.config.files import load_preset
+from apnpql_jax.config.schema import AgentConfig, EnvConfig
+from apnpql_jax.envs.env import make_env
+from apnpql_jax.envs.state import EnvState
+from apnpql_jax.training.rollout import rollout
 from apnpql_jax.types import Array, Transition
 
 sys.path.append(str(tables.ROOT / "tests"))
-from batches import random_batch  # noqa: E402  (the noise that the tests use)
+from apnpql_jax.testing import random_batch
 
 
 def worlds(settings: dict[str, Any]) -> dict[str, sides.Measure]:

@@ -22,8 +22,8 @@ from torch import nn
 from torch.distributions import Bernoulli, MultivariateNormal
 import torch.nn.functional as F
 
-from apnpql_jax.config import AgentConfig
-from apnpql_jax.presets import load_preset
+from apnpql_jax.config.files import load_preset
+from apnpql_jax.config.schema import AgentConfig
 
 JOINTS, PRIMITIVES = 6, 3
 BELOW = JOINTS * (JOINTS - 1) // 2

@@ -56,7 +56,7 @@ class Env(Protocol):
 
 def export(task_name: str, folder: Path) -> None:
   """Writes a task's scene and some of its resets; needs the project."""
-  from apnpql_jax.config import EnvConfig
+  from apnpql_jax.config.schema import EnvConfig
   from apnpql_jax.tasks import make_task
 
   task, config = make_task(task_name), EnvConfig()

@@ -28,7 +28,7 @@ import sides
 import tables
 
 from apnpql_jax import runtime
-from apnpql_jax.presets import preset_names
+from apnpql_jax.config.files import preset_names
 from apnpql_jax.tasks import task_names
 
 RATES = {

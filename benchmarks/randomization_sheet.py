@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from apnpql_jax.config import EnvConfig
-from apnpql_jax.env import make_env
-from apnpql_jax.rollout import expert_policy, rollout
+from apnpql_jax.config.schema import EnvConfig
+from apnpql_jax.envs.env import make_env
 from apnpql_jax.tasks import task_names
+from apnpql_jax.training.rollout import expert_policy, rollout
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "images" / "randomization.png"
 PERIODS = 12

@@ -27,7 +27,7 @@ import mujoco
 import numpy as np
 from render import RESOLUTIONS, SCENE, make_pair, make_poses
 
-from apnpql_jax.presets import mjcf_path
+from apnpql_jax.config.files import mjcf_path
 from apnpql_jax.render import Geoms, intersect, raycast
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.scene import Scene, load_scene

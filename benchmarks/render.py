@@ -26,9 +26,9 @@ import mujoco
 import numpy as np
 from other_renderers import measure_others
 
-from apnpql_jax.cameras import make_cameras
-from apnpql_jax.config import EnvConfig
-from apnpql_jax.presets import mjcf_path
+from apnpql_jax.config.files import mjcf_path
+from apnpql_jax.config.schema import EnvConfig
+from apnpql_jax.envs.cameras import make_cameras
 from apnpql_jax.render import Geoms
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.scene import Scene, load_scene

@@ -17,9 +17,9 @@ import tempfile
 from typing import Any
 
 import numpy as np
-import tiny
 
-from apnpql_jax.config import BACKENDS, OBSERVATIONS
+from apnpql_jax import testing
+from apnpql_jax.config.checks import BACKENDS, OBSERVATIONS
 
 Arrays = dict[str, np.ndarray]
 
@@ -27,20 +27,20 @@ Arrays = dict[str, np.ndarray]
 def main() -> int:
   """Prints the report; 0 if all arrays are the same bits."""
   parser = argparse.ArgumentParser(description=__doc__)
-  parser.add_argument("--algorithm", default=tiny.CONFIG.agent.algorithm)
+  parser.add_argument("--algorithm", default=testing.TINY.agent.algorithm)
   parser.add_argument("--backend", default="auto", choices=BACKENDS)
   parser.add_argument("--obs", default="pixels", choices=OBSERVATIONS)
   parser.add_argument("--iterations", type=int, default=16, help="of each half")
   args = parser.parse_args()
   options = ["--algorithm", args.algorithm, "--backend", args.backend]
   options += ["--obs", args.obs]
-  half = args.iterations * tiny.STEPS
+  half = args.iterations * testing.STEPS
   with tempfile.TemporaryDirectory() as name:
     straight, halves = Path(name) / "straight", Path(name) / "halves"
     for run, total in ((straight, 2 * half), (halves, half), (halves, 2 * half)):
       train(run, *options, "--total-steps", str(total))
     device = json.loads((straight / "versions.json").read_text())["device"]
-    states = [tiny.saved_arrays(run, 2 * half) for run in (straight, halves)]
+    states = [testing.saved_arrays(run, 2 * half) for run in (straight, halves)]
   result = {**vars(args), "device": device, **compare(*states)}
   print(json.dumps(result, indent=2))
   return 0 if result["arrays"] == result["same_bits"] else 1
@@ -53,7 +53,7 @@ def train(run: Path, *args: str) -> None:
     RuntimeError: it did not; with the end of what it said.
   """
   said = run.parent / "said"
-  if tiny.start(run, *args, said=said, xla_flags="").wait():
+  if testing.start(run, *args, said=said, xla_flags="").wait():
     raise RuntimeError(said.read_text()[-2000:])
 
 

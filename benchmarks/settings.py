@@ -8,10 +8,10 @@ import dataclasses
 import itertools
 from typing import Any
 
-import tiny
-
-from apnpql_jax.config import BACKENDS, OBSERVATIONS, TrainConfig
-from apnpql_jax.presets import load_preset
+from apnpql_jax import testing
+from apnpql_jax.config.checks import BACKENDS, OBSERVATIONS
+from apnpql_jax.config.files import load_preset
+from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.tasks import task_names
 
 ENGINES = ("native", "mjx")
@@ -51,5 +51,5 @@ def chosen(args: argparse.Namespace) -> Iterator[tuple[dict[str, Any], TrainConf
 def tiny_pixels() -> TrainConfig:
   """A run so small that its figures mean nothing, with images."""
   sizes = {"global_size": (12, 16), "wrist_size": (8, 12)}
-  env = dataclasses.replace(tiny.CONFIG.env, obs="pixels", **sizes)
-  return dataclasses.replace(tiny.CONFIG, env=env)
+  env = dataclasses.replace(testing.TINY.env, obs="pixels", **sizes)
+  return dataclasses.replace(testing.TINY, env=env)

@@ -31,9 +31,9 @@ from typing import Any
 
 import damage
 import numpy as np
-import tiny
 
-from apnpql_jax import checkpoint, runs
+from apnpql_jax import errors, testing
+from apnpql_jax.runs import checkpoint_reader
 
 RESULTS = Path(__file__).resolve().parent / "results"
 INTERVAL = 512
@@ -59,12 +59,12 @@ class Trial:
   def start(self, run: Path, *args: str) -> Process:
     """A process that trains; its output replaces that of the one before."""
     self._said.write_text("")
-    return tiny.start(run, *OPTIONS.split(), *(args or FOR_EVER), said=self._said)
+    return testing.start(run, *OPTIONS.split(), *(args or FOR_EVER), said=self._said)
 
   def disturb(self, fault: str) -> dict[str, Any]:
     """Trains for some seconds, does something, and tells what came of it."""
     run, target = self.run, self.run
-    before = checkpoint.latest_step(run) or 0
+    before = checkpoint_reader.latest_step(run) or 0
     if fault.startswith("poisoned"):
       target = run.with_name("poisoned")
       shutil.copytree(run, target)
@@ -74,11 +74,11 @@ class Trial:
     code = self._end(process, fault)
     row = {"fault": fault, "exit": code, "from": before, "to": reached(target)}
     if target is run:
-      row["lost"] = row["to"] - (checkpoint.latest_step(run) or 0)
-      if fault == "bit flip" and len(checkpoint.all_steps(run)) > 1:
+      row["lost"] = row["to"] - (checkpoint_reader.latest_step(run) or 0)
+      if fault == "bit flip" and len(checkpoint_reader.all_steps(run)) > 1:
         row["file"] = damage.flip_a_bit(run, self._rng)
     else:
-      faults = [r for r in tiny.rows(target) if r["step"] > before]
+      faults = [r for r in testing.rows(target) if r["step"] > before]
       for name in ("faults/worlds", "faults/updates"):
         row[name] = sum(r.get(name) or 0 for r in faults)
       if dumps := list(target.glob("faults/*.npz")):
@@ -131,9 +131,9 @@ EXPECTED = {
   "kill": -signal.SIGKILL,
   "SIGTERM": 128 + signal.SIGTERM,
   "poisoned world": 128 + signal.SIGTERM,
-  "poisoned rewards": runs.FAILED,
+  "poisoned rewards": errors.FAILED,
   "kill in a save": -signal.SIGKILL,
-  "disk full": runs.FAILED,
+  "disk full": errors.FAILED,
   "bit flip": -signal.SIGKILL,
   "SIGINT": 128 + signal.SIGINT,
 }
@@ -153,7 +153,7 @@ def as_expected(row: dict[str, Any]) -> bool:
 
 def reached(run: Path) -> int:
   """Environment steps of the last whole row of the metrics."""
-  rows = tiny.rows(run)
+  rows = testing.rows(run)
   return rows[-1]["step"] if rows else 0
 
 
@@ -190,7 +190,7 @@ def same_bits(trials: list[Trial], total: int, patience_s: float) -> bool:
   if [ended(process, patience_s) for process in processes] != [0] * len(trials):
     print("\n".join(trial.said() for trial in trials), file=sys.stderr)
     return False
-  first, *others = (tiny.saved_bytes(trial.run, total) for trial in trials)
+  first, *others = (testing.saved_bytes(trial.run, total) for trial in trials)
   return all(bits == first for bits in others)
 
 
@@ -200,11 +200,11 @@ def same_metrics(*runs: Path) -> bool:
   Runs may differ in length; they are compared as far as the shortest goes.
   """
   losses = [
-    [(row["step"], row["loss/q"]) for row in tiny.rows(run) if "loss/q" in row]
+    [(row["step"], row["loss/q"]) for row in testing.rows(run) if "loss/q" in row]
     for run in runs
   ]
   whole = all(
-    step == number * tiny.STEPS
+    step == number * testing.STEPS
     for run in losses
     for number, (step, _) in enumerate(run, start=1)
   )
@@ -246,7 +246,7 @@ def soak(
   finally:
     process.terminate()
   stopped = ended(process) == EXPECTED["SIGTERM"]
-  total = reached(disturbed.run) + tiny.STEPS
+  total = reached(disturbed.run) + testing.STEPS
   # The disturbed run has taken the time of the soak to come here.
   patience_s = PATIENCE_S + 60 * minutes
   result = {
@@ -268,7 +268,7 @@ def soak(
 def _repeat(dump: Path) -> str:
   """What ``apnpql repeat`` says of a dumped update."""
   command = [sys.executable, "-m", "apnpql_jax", "repeat", str(dump)]
-  env = os.environ | {"PYTHONPATH": str(tiny.ROOT)}
+  env = os.environ | {"PYTHONPATH": str(testing.ROOT)}
   done = subprocess.run(command, cwd=dump.parent, env=env, capture_output=True)
   return done.stdout.decode()
 

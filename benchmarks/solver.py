@@ -18,13 +18,13 @@ from pathlib import Path
 
 import apnpql_jax  # noqa: F401  isort: skip  (before JAX: sets threads and cache)
 
-from apnpql_jax.config import EnvConfig
-from apnpql_jax.contact_report import contact_report
-from apnpql_jax.env import Env
-from apnpql_jax.evaluate import play_held_out
-from apnpql_jax.primitives.bank import load_bank
-from apnpql_jax.rollout import expert_policy, make_player
+from apnpql_jax.config.schema import EnvConfig
+from apnpql_jax.envs.contact_report import contact_report
+from apnpql_jax.envs.env import Env
+from apnpql_jax.primitives.reset_bank import load_bank
 from apnpql_jax.tasks import make_task, task_names
+from apnpql_jax.training.evaluate import play_held_out
+from apnpql_jax.training.rollout import expert_policy, make_player
 
 RESULT = Path(__file__).resolve().parent / "results" / "solver.json"
 SETTINGS = ["20x20", "10x10", "5x10", "5x5", "3x10", "10x10x999", "10x10x16", "10x10x8"]

@@ -21,14 +21,14 @@ import jax.numpy as jnp
 import numpy as np
 import tables
 
-from apnpql_jax.config import EnvConfig
-from apnpql_jax.contact_report import contact_report
-from apnpql_jax.env import Env, make_env
-from apnpql_jax.evaluate import evaluate_expert
-from apnpql_jax.primitives.bank import load_bank
-from apnpql_jax.recording import film, record_episodes
-from apnpql_jax.rollout import FILMED, expert_policy, make_player
+from apnpql_jax.config.schema import EnvConfig
+from apnpql_jax.envs.contact_report import contact_report
+from apnpql_jax.envs.env import Env, make_env
+from apnpql_jax.primitives.reset_bank import load_bank
 from apnpql_jax.tasks import make_task, task_names
+from apnpql_jax.training.evaluate import evaluate_expert
+from apnpql_jax.training.rollout import FILMED, expert_policy, make_player
+from apnpql_jax.training.video import film, record_episodes
 
 RESULTS = tables.RESULTS / "tasks"
 DOC = tables.ROOT / "docs" / "tasks.md"

@@ -18,12 +18,12 @@ import statistics
 import time
 from typing import Any
 
+from apnpql_jax import devices
+
 import apnpql_jax  # noqa: F401  isort: skip  (before JAX: sets threads and cache)
 import floor
 import jax
 import tables
-
-from apnpql_jax import memory
 
 SECONDS = 0.5
 """Of work per repeat, at least."""
@@ -124,7 +124,7 @@ def compiled(
   seconds = time.perf_counter() - began
   if (sizes := program.memory_analysis()) is not None:
     new = sizes.output_size_in_bytes - sizes.alias_size_in_bytes
-    memory.check_memory(sizes.temp_size_in_bytes + new, "the program")
+    devices.check_memory(sizes.temp_size_in_bytes + new, "the program")
   return program, seconds
 
 

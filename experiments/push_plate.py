@@ -5,7 +5,7 @@ What is not the paper's was found by experiment; `experiments/log.md` has the tr
 
 from __future__ import annotations
 
-from apnpql_jax.config import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
+from apnpql_jax import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
 
 CONFIG = TrainConfig(
   env=EnvConfig(task="push_plate", obs="pixels", backend="auto", worlds=32),

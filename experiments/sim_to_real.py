@@ -1,4 +1,4 @@
-"""Put a plate into a box in randomised worlds (paper Sec. V-C).
+"""Put a plate into a box in randomized worlds (paper Sec. V-C).
 
 The agent of place_plate, with larger images, as the paper has for its transfer to a
 real robot, and a shadow.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from apnpql_jax.presets import load_preset
+from apnpql_jax.config.files import load_preset
 
 _PLACE = load_preset("place_plate")
 

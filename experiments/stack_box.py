@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from apnpql_jax.presets import load_preset
+from apnpql_jax.config.files import load_preset
 
 _PUSH = load_preset("push_plate")
 

@@ -11,14 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import apnpql_jax  # noqa: F401  (sets threads and the compilation cache)
+from apnpql_jax import runtime
 from apnpql_jax.sim import physics
+from apnpql_jax.sim.engines import make_physics
 from apnpql_jax.sim.kinematics import Kinematics, make_kinematics
 from apnpql_jax.tasks import Task, make_task
 from apnpql_jax.tasks.task import ResetDraw
 
 # Figures are written to files; no test may need a display.
 os.environ.setdefault("MPLBACKEND", "Agg")
+runtime.configure()
 
 
 @pytest.fixture(scope="session")
@@ -32,7 +34,7 @@ def task() -> Task:
 def engines(task: Task) -> dict[str, Callable]:
   """Engine name -> jitted control period over worlds; compiled once per shape."""
   return {
-    name: jax.jit(physics.make_physics(name, task.scene, substeps=30).step)
+    name: jax.jit(make_physics(name, task.scene, substeps=30).step)
     for name in ("native", "mjx")
   }
 
@@ -67,7 +69,7 @@ def rest(
 ) -> Callable[[physics.PhysicsState], physics.PhysicsState]:
   """1.2 s with the arm at rest and the hand open; C MuJoCo unless a test names MJX."""
   backend = getattr(request, "param", "native")
-  engine = jax.jit(physics.make_physics(backend, task.scene, substeps=240).step)
+  engine = jax.jit(make_physics(backend, task.scene, substeps=240).step)
 
   def step(state: physics.PhysicsState) -> physics.PhysicsState:
     worlds = len(state.qpos)

@@ -28,7 +28,7 @@ def get_state(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 
 
 def ray_directions(height: int, width: int, fovy_deg: float) -> np.ndarray:
-  """f64[H, W, 3]: unit rays through the pixel centres in the camera's frame."""
+  """f64[H, W, 3]: unit rays through the pixel centers in the camera's frame."""
   half = np.tan(np.radians(fovy_deg) / 2)
   out = np.zeros((height, width, 3))
   for row in range(height):

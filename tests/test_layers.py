@@ -1,4 +1,4 @@
-"""Which module may know which: read from the import statements, nothing is run."""
+"""The order of the rooms, read from import statements; nothing is executed."""
 
 from __future__ import annotations
 
@@ -8,42 +8,29 @@ import re
 
 import pytest
 
-PACKAGE = Path(__file__).resolve().parents[1] / "apnpql_jax"
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "apnpql_jax"
 NAME = PACKAGE.name
 
-LOOP = {
-  "rollout",
-  "iteration",
-  "evaluate",
-  "demonstrations",
-  "faults",
-  "recording",
-  "recordings",
-  "reporter",
-  "train",
-  "cli",
-  "commands",
-  "options",
-  "resuming",
-  "__main__",
-}
-"""Modules that see both the world and the agent, or start those that do."""
+STAIR = (
+  "version errors console types runtime dists config devices sim render tasks "
+  "randomization primitives envs agents data runs training testing cli __main__"
+).split()
+"""Rooms from the bottom up: each imports only from itself and from earlier ones."""
 
-WORLD = {"sim", "render", "primitives", "tasks", "env", "env_state"}
-FORBIDDEN = {
-  "sim": LOOP | {"render", "primitives", "tasks", "env", "agents", "replay", "dists"},
-  "render": LOOP | {"primitives", "tasks", "env", "agents", "replay", "dists"},
-  "primitives": LOOP | {"env", "agents", "replay", "dists"},
-  "tasks": LOOP | {"env", "agents", "replay", "dists"},
-  "env": LOOP | {"agents", "replay", "dists"},
-  "env_state": LOOP | {"env", "agents", "replay", "dists"},
-  "agents": LOOP | WORLD | {"replay"},
-  "replay": LOOP | WORLD | {"agents", "dists"},
+APART = {
+  "agents": {"sim", "render", "tasks", "primitives", "randomization", "envs"},
+  "data": {"agents", "render", "randomization", "envs"},
+  "runs": {"agents", "sim", "render", "tasks", "envs", "data"},
+  "render": {"sim", "tasks"},
 }
+"""Rooms that must not reach others although those come earlier."""
+
+Graph = dict[str, set[str]]
 
 
 def imports(source: str, module: str, is_package: bool) -> set[str]:
-  """Dotted names inside the package that ``source`` imports, at any depth."""
+  """Returns the dotted names inside the package that ``source`` imports anywhere."""
   found = set()
   for node in ast.walk(ast.parse(source)):
     if isinstance(node, ast.Import):
@@ -56,27 +43,33 @@ def imports(source: str, module: str, is_package: bool) -> set[str]:
   return {name for name in found if name.split(".")[0] == NAME}
 
 
-def modules() -> dict[str, set[str]]:
-  """Module -> modules of the package that it imports directly."""
+def modules() -> Graph:
+  """Returns module -> modules of the package that it imports, without the API."""
   paths = {}
   for path in PACKAGE.rglob("*.py"):
     parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
     is_package = parts[-1] == "__init__"
     paths[".".join(parts[:-1] if is_package else parts)] = (path, is_package)
-  return {
+  graph = {
     name: imports(path.read_text(encoding="utf-8"), name, is_package) & paths.keys()
     for name, (path, is_package) in paths.items()
   }
+  # Importing a module imports the packages around it, which is no dependency.
+  return {
+    name: {known for known in graph[name] if not name.startswith(f"{known}.")} - {name}
+    for name in graph.keys() - {NAME}
+  }
 
 
-def layer(module: str) -> str:
-  """The first name below the package: ``apnpql_jax.sim.scene`` is in ``sim``."""
-  return (module.split(".") + [""])[1]
+def room(module: str) -> str:
+  """Returns the first name below the package: that of ``apnpql_jax.sim.arm`` is sim."""
+  return module.split(".")[1]
 
 
-def reached(start: str, graph: dict[str, set[str]]) -> set[str]:
-  """Modules that ``start`` imports, directly or through others."""
-  seen, todo = set(), [start]
+def reached(start: str, graph: Graph) -> set[str]:
+  """Returns the modules that ``start`` imports, directly or through others."""
+  seen: set[str] = set()
+  todo = [start]
   while todo:
     for name in graph[todo.pop()] - seen - {NAME}:
       seen.add(name)
@@ -91,56 +84,56 @@ def reached(start: str, graph: dict[str, set[str]]) -> set[str]:
     ("from apnpql_jax.sim import scene as s", "apnpql_jax.sim.scene"),
     ("from ..sim import scene", "apnpql_jax.sim.scene"),
     ("def f():\n  from apnpql_jax import env", "apnpql_jax.env"),
-    ("if x:\n  from ..env import reset", "apnpql_jax.env"),
+    ("if TYPE_CHECKING:\n  from ..env import reset", "apnpql_jax.env"),
   ],
 )
-def test_every_way_to_import_is_seen(statement, expected):
+def test_every_kind_of_import_is_found(statement, expected):
   assert expected in imports(statement, "apnpql_jax.agents.learner", False)
 
 
-@pytest.mark.parametrize("name", sorted(FORBIDDEN))
-def test_layer_knows_only_what_it_may(name):
+def test_every_room_has_its_step():
+  assert {room(module) for module in modules()} == set(STAIR)
+
+
+def test_imports_lead_down_the_stair():
+  steps = {name: index for index, name in enumerate(STAIR)}
+  upward = [
+    f"{module} imports {known}"
+    for module, imported in modules().items()
+    for known in imported
+    if steps[room(known)] > steps[room(module)]
+  ]
+  assert not upward
+
+
+def test_no_module_reaches_itself():
   graph = modules()
-  members = [module for module in graph if layer(module) == name]
-  assert members, f"no module in {name}: mend this test with the layout"
+  assert not [module for module in graph if module in reached(module, graph)]
+
+
+@pytest.mark.parametrize("name", sorted(APART))
+def test_rooms_that_must_not_meet_do_not(name):
+  graph = modules()
+  members = [module for module in graph if room(module) == name]
   broken = [
     f"{module} reaches {other}"
     for module in members
     for other in reached(module, graph)
-    if layer(other) in FORBIDDEN[name]
+    if room(other) in APART[name]
   ]
-  assert not broken
+  assert members and not broken
 
 
-def test_distributions_know_nobody():
+def test_distributions_import_nothing_else_of_the_package():
   graph = modules()
-  members = [module for module in graph if layer(module) == "dists"]
-  assert members
-  outside = {x for m in members for x in graph[m] if layer(x) != "dists"} - {NAME}
-  assert not outside
-
-
-def test_only_the_loop_sees_both_sides():
-  graph = modules()
-  assert {"apnpql_jax.rollout", "apnpql_jax.evaluate", "apnpql_jax.train"} <= set(graph)
-  both = [
-    module
-    for module in graph
-    if layer(module) not in LOOP
-    and {"agents"} & {layer(x) for x in reached(module, graph)}
-    and WORLD & {layer(x) for x in reached(module, graph)}
-  ]
-  assert not both
-
-
-def test_only_the_entry_point_knows_the_command_line():
-  graph = modules()
-  knowing = {m for m, known in graph.items() if f"{NAME}.cli" in known}
-  assert knowing == {f"{NAME}.__main__"}
+  members = [module for module in graph if room(module) == "dists"]
+  outside = {x for m in members for x in graph[m] if room(x) != "dists"}
+  assert members and not outside
 
 
 def test_tests_that_documents_name_exist():
-  files = {path.stem: path.read_text() for path in Path(__file__).parent.glob("*.py")}
+  files = {p.stem: p.read_text() for p in Path(__file__).parent.rglob("test_*.py")}
   known = files.keys() | set(re.findall(r"def (test_\w+)\(", "".join(files.values())))
-  for document in PACKAGE.parent.glob("docs/*.md"):
-    assert set(re.findall(r"`(test_\w+)", document.read_text())) <= known, document
+  for document in (ROOT / "docs").rglob("*.md"):
+    named = set(re.findall(r"`(?:tests/[\w/]*)?(test_\w+)", document.read_text()))
+    assert named <= known, document

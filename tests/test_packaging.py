@@ -16,8 +16,8 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 import pytest
 
-from apnpql_jax import presets
-from apnpql_jax.config import ConfigError
+from apnpql_jax.config import files
+from apnpql_jax.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -54,7 +54,7 @@ def python(site: Path, cwd: Path, *args: str) -> str:
 
 
 def locked(name: str) -> dict[str, str]:
-  """Normalised name -> version of a lock file."""
+  """Normalized name -> version of a lock file."""
   pairs = [line.split("==") for line in (ROOT / name).read_text().splitlines()]
   return {canonicalize_name(package): version for package, version in pairs}
 
@@ -77,14 +77,15 @@ def test_wheel_holds_scenes_presets_and_the_whole_package(wheel):
 
 def test_wheel_works_from_another_directory(installed, tmp_path):
   code = (
-    "import apnpql_jax; from apnpql_jax import presets; print(apnpql_jax.__file__);"
-    "print(presets.mjcf_path('push_plate')); presets.load_preset('push_plate')"
+    "import apnpql_jax; print(apnpql_jax.__file__);"
+    "from apnpql_jax.config import files;"
+    "print(files.mjcf_path('push_plate')); files.load_preset('push_plate')"
   )
   for line in python(installed, tmp_path, "-c", code).splitlines():
     assert Path(line).is_relative_to(installed)
   out = python(installed, tmp_path, "-m", "apnpql_jax", "list", "--json")
   names = json.loads(out)
-  assert names["presets"] == presets.preset_names()
+  assert names["presets"] == files.preset_names()
   assert set(names["presets"]) == {*names["tasks"], "sim_to_real"}
 
 
@@ -98,7 +99,7 @@ def test_scenes_in_the_wheel_compile(installed, tmp_path):
 
 def test_command_is_declared(installed):
   (entry,) = installed.glob("*.dist-info/entry_points.txt")
-  assert "apnpql = apnpql_jax.cli:main" in entry.read_text()
+  assert "apnpql = apnpql_jax.cli.main:main" in entry.read_text()
 
 
 @pytest.mark.parametrize("name", ["requirements.lock", "requirements-dev.lock"])
@@ -132,6 +133,6 @@ def test_mujoco_and_mjx_are_a_matched_pair():
 )
 def test_names_cannot_leave_their_folder(name):
   with pytest.raises(ConfigError, match="push_plate"):
-    presets.load_preset(name)
+    files.load_preset(name)
   with pytest.raises(ConfigError, match="push_plate"):
-    presets.mjcf_path(name)
+    files.mjcf_path(name)

@@ -1,4 +1,4 @@
-"""Process settings: what ``import apnpql_jax`` leaves in a fresh process."""
+"""Process settings: what ``configure`` sets, and what an import leaves alone."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ NAMES = (
   "JAX_DEFAULT_MATMUL_PRECISION",
   "XLA_FLAGS",
 )
+CONFIGURE = "import apnpql_jax; apnpql_jax.configure()"
 
 
 def run(code: str, **env: str) -> str:
@@ -36,14 +37,28 @@ def run(code: str, **env: str) -> str:
 
 
 def settings(before: str = "", **env: str) -> dict[str, str]:
-  """Environment after ``import apnpql_jax`` in a process of its own."""
-  report = "import apnpql_jax; print(json.dumps(dict(os.environ)))"
+  """Environment after ``apnpql_jax.configure()`` in a process of its own."""
+  report = f"{CONFIGURE}; print(json.dumps(dict(os.environ)))"
   return json.loads(run(f"import json, os\n{before}\n{report}", **env))
 
 
 def threads(env: dict[str, str], cores: int) -> int:
   """Size of the pool XLA makes: the first variable set, else one per core."""
   return int(env.get("PJRT_NPROC") or env.get("NPROC") or cores)
+
+
+def test_an_import_changes_no_variable_and_starts_no_backend():
+  code = (
+    "import json, os, pkgutil; import jax, mujoco.mjx, flax, distrax, mink;"
+    "import orbax.checkpoint, imageio, matplotlib; before = dict(os.environ);"
+    "import apnpql_jax;"
+    "[__import__(m.name) for m in pkgutil.walk_packages(apnpql_jax.__path__,"
+    " 'apnpql_jax.') if not m.name.endswith('__main__')];"
+    "from jax._src import xla_bridge;"
+    "print([n for n in os.environ if os.environ[n] != before.get(n)],"
+    " xla_bridge.backends_are_initialized())"
+  )
+  assert run(code).splitlines()[-1] == "[] False"
 
 
 @pytest.mark.parametrize(
@@ -77,11 +92,11 @@ def test_what_the_user_sets_is_kept(tmp_path):
 def test_sums_stay_inside_xla_beside_what_the_user_asks_of_it():
   code = "print(jax.jit(lambda x: (x * x).sum(1)).lower(jax.numpy.ones((32, 64, 3)))"
   fused = [
-    "ynn_fusion" in run(f"import {names}; {code}.compile().as_text())", **flags)
-    for names, flags in (
-      ("jax", {}),
-      ("apnpql_jax, jax", {}),
-      ("jax, apnpql_jax", {"XLA_FLAGS": "--xla_cpu_enable_fast_math=false"}),
+    "ynn_fusion" in run(f"{start}; {code}.compile().as_text())", **flags)
+    for start, flags in (
+      ("import jax", {}),
+      (f"{CONFIGURE}; import jax", {}),
+      (f"import jax; {CONFIGURE}", {"XLA_FLAGS": "--xla_cpu_enable_fast_math=false"}),
     )
   ]
   assert fused == [True, False, False]
@@ -103,7 +118,9 @@ def test_cache_lies_in_the_cache_folder_of_the_user(tmp_path):
 
 
 @pytest.mark.parametrize(
-  "order", ["import apnpql_jax, jax", "import jax, apnpql_jax"], ids=["first", "after"]
+  "order",
+  [f"{CONFIGURE}; import jax", f"import jax; {CONFIGURE}"],
+  ids=["first", "after"],
 )
 def test_jax_takes_the_settings_whichever_is_imported_first(order, tmp_path):
   code = (

@@ -1,6 +1,6 @@
-"""Augmentation of the images of a batch: random shifts and colour jitter.
+"""Augmentation of the images of a batch: random shifts and color jitter.
 
-A network that sees each image a little elsewhere and in other colours cannot tell
+A network that sees each image a little elsewhere and in other colors cannot tell
 states by single pixels.
 """
 
@@ -26,7 +26,7 @@ def augment(
     key: typed PRNG key.
     batch: [B, ...].
     shift: largest shift along each axis, pixels; 0 for none.
-    jitter: largest change of brightness of each colour channel, a share; 0 for none.
+    jitter: largest change of brightness of each color channel, a share; 0 for none.
     together: observations are windows [B, L, ...]; all images of a window are changed
       in the same way, for what differs between them is what an LSTM is to see.
   """
@@ -60,13 +60,13 @@ def _observation(
 def _image(key: Array, image: Array, *, shift: int, jitter: float) -> Array:
   shift_key, color_key = jax.random.split(key)
   if shift:
-    image = shifted(shift_key, image, shift)
+    image = shift_images(shift_key, image, shift)
   if jitter:
-    image = jittered(color_key, image, jitter)
+    image = jitter_colors(color_key, image, jitter)
   return image
 
 
-def shifted(key: Array, image: Array, most: int) -> Array:
+def shift_images(key: Array, image: Array, most: int) -> Array:
   """Moves images by whole pixels; the border is repeated where nothing is known.
 
   Args:
@@ -84,8 +84,8 @@ def shifted(key: Array, image: Array, most: int) -> Array:
   return jax.vmap(crop)(padded, starts).reshape(image.shape)
 
 
-def jittered(key: Array, image: Array, most: float) -> Array:
-  """Multiplies each colour channel of each image by a factor of its own.
+def jitter_colors(key: Array, image: Array, most: float) -> Array:
+  """Multiplies each color channel of each image by a factor of its own.
 
   Args:
     key: typed PRNG key.

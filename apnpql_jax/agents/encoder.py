@@ -20,7 +20,7 @@ _STEP_SCALE = 7.0
 """Brings a joint's change per control period (0.15 rad at most) to order one."""
 
 _POSITION_SCALE = 5.0
-"""Brings positions within reach of the arm (m) to order one, centimetres to 0.05."""
+"""Brings positions within reach of the arm (m) to order one, centimeters to 0.05."""
 
 _NEAR = 0.05, 0.2
 """m; distances from the tool within which points are seen in detail."""
@@ -169,7 +169,7 @@ def keypoints(scores: Array) -> Array:
 def seen_from(tool: Array, points: Array) -> Array:
   """Where points are from the tool, the more exactly the nearer they are.
 
-  A millimetre decides whether a hand can close, and is lost among the half metre of a
+  A millimeter decides whether a hand can close, and is lost among the half meter of a
   table.
 
   Args:
@@ -225,7 +225,7 @@ def windows(cells: Array) -> Array:
 
   Returns:
     f32[*b, R, S, 9 C]: the whole cell, then the touching column of the right
-    neighbour, the touching row of the one below, and the corner of the diagonal one.
+    neighbor, the touching row of the one below, and the corner of the diagonal one.
   """
   own = cells.reshape(*cells.shape[:-2], -1)
   border = [(0, 0)] * (cells.ndim - 4) + [(0, 1), (0, 1), (0, 0), (0, 0)]

@@ -11,12 +11,15 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from apnpql_jax.agents import objectives
-from apnpql_jax.agents.algorithms import Algorithm, algorithm_of, epsilon_bounds
+from apnpql_jax.agents import losses
 from apnpql_jax.agents.augmentation import augment
-from apnpql_jax.agents.networks import Heads, Networks, Params, make_networks
-from apnpql_jax.agents.policies import Candidates
-from apnpql_jax.config import AgentConfig, TrainConfig, validate
+from apnpql_jax.agents.columns.candidates import Candidates
+from apnpql_jax.agents.columns.policy_evaluation import Evaluation
+from apnpql_jax.agents.heads import Heads, Networks, Params
+from apnpql_jax.agents.networks import make_networks
+from apnpql_jax.agents.table_one import Algorithm, algorithm_of, epsilon_bounds
+from apnpql_jax.config.checks import validate
+from apnpql_jax.config.schema import AgentConfig, TrainConfig
 from apnpql_jax.dists import boltzmann
 from apnpql_jax.types import Array, Metrics, Observation, Transition
 
@@ -36,6 +39,7 @@ class Agent:
   """Pure functions of one configuration; all can be jitted, scanned and sharded."""
 
   networks: Networks
+  evaluation: Evaluation
 
   init: Callable[[Array, Observation], LearnerState]
   """(key, example observation with a batch axis) -> state before learning."""
@@ -62,8 +66,9 @@ def make_agent(config: AgentConfig) -> Agent:
   validate(TrainConfig(agent=config), algorithms=epsilon_bounds())
   algorithm = algorithm_of(config)
   groups = algorithm.groups(config)
-  networks = make_networks(config, groups, algorithm.policy_evaluation(config))
-  optimiser = make_optimiser(config, groups)
+  evaluation = algorithm.policy_evaluation(config)
+  networks = make_networks(config, groups, evaluation)
+  optimizer = make_optimizer(config, groups)
 
   def init(key: Array, observation: Observation) -> LearnerState:
     params = networks.init(key, observation)
@@ -72,7 +77,7 @@ def make_agent(config: AgentConfig) -> Agent:
       params=params,
       target_params=jax.tree.map(jnp.copy, params),
       nu=nu,
-      opt_state=optimiser.init({**params, "nu": nu}),
+      opt_state=optimizer.init({**params, "nu": nu}),
       step=jnp.zeros((), jnp.int32),
     )
 
@@ -93,12 +98,21 @@ def make_agent(config: AgentConfig) -> Agent:
         jitter=config.color_jitter,
         together=config.lstm_instants > 0,
       )
-    target = bellman_target(networks, algorithm, state.target_params, batch, key_t)
-    trained = {**state.params, "nu": state.nu}
-    grads, metrics = jax.grad(total_loss, argnums=2, has_aux=True)(
-      networks, algorithm, trained, state.target_params, batch, target, key_tm1
+    target = bellman_target(
+      networks, algorithm, evaluation, state.target_params, batch, key_t
     )
-    steps, opt_state = optimiser.update(grads, state.opt_state, trained)
+    trained = {**state.params, "nu": state.nu}
+    grads, metrics = jax.grad(total_loss, argnums=3, has_aux=True)(
+      networks,
+      algorithm,
+      evaluation,
+      trained,
+      state.target_params,
+      batch,
+      target,
+      key_tm1,
+    )
+    steps, opt_state = optimizer.update(grads, state.opt_state, trained)
     params = jax.tree.map(jnp.add, trained, steps)
     nu = jnp.maximum(params.pop("nu"), 0.0)
     metrics |= {f"grad_norm/{k}": optax.tree.norm(grads[k]) for k in groups}
@@ -110,10 +124,10 @@ def make_agent(config: AgentConfig) -> Agent:
     )
     return LearnerState(params, target_params, nu, opt_state, state.step + 1), metrics
 
-  return Agent(networks, init, act, update)
+  return Agent(networks, evaluation, init, act, update)
 
 
-def make_optimiser(
+def make_optimizer(
   config: AgentConfig, groups: tuple[str, ...]
 ) -> optax.GradientTransformation:
   """Adam with a clipped global norm for each step of Algorithm 1, by group.
@@ -173,6 +187,7 @@ def _act(
 def bellman_target(
   networks: Networks,
   algorithm: Algorithm,
+  evaluation: Evaluation,
   target_params: Params,
   batch: Transition,
   key: Array,
@@ -183,7 +198,7 @@ def bellman_target(
     heads = networks.at(target_params, observation)
     return heads, _candidates(algorithm, heads, key, heads.config.target_samples)
 
-  return networks.evaluation.target(look, batch)
+  return evaluation.target(look, batch)
 
 
 def _candidates(
@@ -194,8 +209,8 @@ def _candidates(
   *,
   greedy: bool = False,
 ) -> Candidates:
-  """The policy of these heads, which are their own past if the regulariser asks."""
-  prior = algorithm.regulariser(heads, heads)
+  """The policy of these heads, which are their own past if the regularizer asks."""
+  prior = algorithm.regularizer(heads, heads)
   return algorithm.policy(heads, prior, key, num_samples=num_samples, greedy=greedy)
 
 
@@ -213,6 +228,7 @@ def _ap_errors(predicted: Array, label: Array) -> Metrics:
 def total_loss(
   networks: Networks,
   algorithm: Algorithm,
+  evaluation: Evaluation,
   trained: Params,
   target_params: Params,
   batch: Transition,
@@ -220,24 +236,22 @@ def total_loss(
   key: Array,
 ) -> tuple[Array, Metrics]:
   """Sum of the losses of Algorithm 1; each reaches only its own parameters."""
-  config, evaluation = networks.config, networks.evaluation
+  config = networks.config
   heads = networks.at(trained, batch.observation_tm1)
   slow = networks.at(target_params, batch.observation_tm1)
   predicted = heads.primitives()
   outputs = heads.z(batch.action_tm1[None])[0]
-  prior = algorithm.regulariser(heads, slow)
+  prior = algorithm.regularizer(heads, slow)
   improved = algorithm.policy_update(heads, prior, key)
   candidates = improved.candidates
   q_values, weights = candidates.q_values, improved.weights
-  losses = {
-    "loss/ap": objectives.ap_loss(
-      predicted, batch.primitives_tm1, delta=config.ap_delta
-    ),
+  terms = {
+    "loss/ap": losses.ap_loss(predicted, batch.primitives_tm1, delta=config.ap_delta),
     "loss/q": evaluation.loss(outputs, target),
     **improved.losses,
-    **algorithm.regulariser_update(heads, prior, candidates, batch, key, trained["nu"]),
+    **algorithm.regularizer_update(heads, prior, candidates, batch, key, trained["nu"]),
   }
-  per_state = losses | {
+  per_state = terms | {
     **_ap_errors(predicted, batch.primitives_tm1),
     "npql/kl_over_eps": improved.kl / config.epsilon,
     "npql/ess": boltzmann.effective_sample_size(weights),
@@ -249,8 +263,8 @@ def total_loss(
     "q/data": evaluation.value(outputs),
     "q/target": evaluation.expected(target),
   }
-  metrics = {k: objectives.weighted_mean(v, batch.weight) for k, v in per_state.items()}
+  metrics = {k: losses.weighted_mean(v, batch.weight) for k, v in per_state.items()}
   scale = {"loss/ap": config.lambda_ap}
-  total = jnp.sum(jnp.stack([scale.get(k, 1.0) * metrics[k] for k in losses]))
+  total = jnp.sum(jnp.stack([scale.get(k, 1.0) * metrics[k] for k in terms]))
   metrics["q/min"], metrics["q/max"] = jnp.min(q_values), jnp.max(q_values)
   return total, metrics

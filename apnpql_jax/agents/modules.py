@@ -52,8 +52,8 @@ class ValueHead(nn.Module):
     """phi f32[*b, n], actions f32[S, *b, 7] -> f32[S, *b, len(initial)]."""
     width, *rest = self.hidden
     from_phi = nn.Dense(width, name="phi")(phi)
-    centred = actions.at[..., -1].set(2.0 * actions[..., -1] - 1.0)
-    x = nn.Dense(width, use_bias=False, name="action")(centred) + from_phi[None]
+    centered = actions.at[..., -1].set(2.0 * actions[..., -1] - 1.0)
+    x = nn.Dense(width, use_bias=False, name="action")(centered) + from_phi[None]
     x = nn.relu(x)
     for width in rest:
       x = nn.relu(nn.Dense(width)(x))

@@ -32,7 +32,7 @@ class ActionDistribution(Protocol):
 
 
 class UniformBox(struct.PyTreeNode):
-  """Uniform over [-1, 1]^D x {0, 1}: what regularises plain entropy maximisation.
+  """Uniform over [-1, 1]^D x {0, 1}: what regularizes plain entropy maximization.
 
   The density is the same everywhere, beyond the box too: an action drawn out there
   is clipped to the box before anything sees it. KL(pi || uniform) is then

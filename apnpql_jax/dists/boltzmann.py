@@ -15,7 +15,7 @@ Array = jax.Array
 
 
 def importance_weights(q_values: Array, alpha: Array) -> Array:
-  """Self-normalised importance weights softmax(Q / alpha), f32[S, *b] (Eq. 6)."""
+  """Self-normalized importance weights softmax(Q / alpha), f32[S, *b] (Eq. 6)."""
   return jax.nn.softmax(q_values / alpha[None], axis=0)
 
 

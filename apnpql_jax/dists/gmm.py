@@ -27,7 +27,7 @@ class GripperGMM(struct.PyTreeNode):
   An action is ``f32[D + 1]``, the gripper in {0, 1} last. ``*b`` are batch axes.
   """
 
-  logits: Array  # f32[*b, K]: unnormalised log weights
+  logits: Array  # f32[*b, K]: unnormalized log weights
   mean: Array  # f32[*b, K, D]
   scale_tril: Array  # f32[*b, K, D, D]: lower Cholesky factor, positive diagonal
   gripper_logits: Array  # f32[*b, K]: log odds of gripper = 1

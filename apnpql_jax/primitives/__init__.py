@@ -1,0 +1,1 @@
+"""Action primitives: joint targets, reset states, following."""

@@ -1,47 +1,27 @@
-"""Inverse kinematics on the host, by mink.
+"""Inverse kinematics on the host, with mink.
 
-No JAX in here: worker processes import this module.
+Worker processes import this module, so it imports no JAX code of the package.
 """
 
 from __future__ import annotations
-
-import dataclasses
 
 import mink
 import mujoco
 import numpy as np
 
-from apnpql_jax.presets import mjcf_path
+from apnpql_jax.config.files import mjcf_path
 
-TOOL_SITE = "tool"
 MAX_ITERATIONS = 60
 POSITION_TOLERANCE = 1e-3
-"""m; residual above which a target counts as unreachable."""
+"""m; a target with a larger residual counts as unreachable."""
 ROTATION_TOLERANCE = np.deg2rad(0.5)
 """rad; likewise."""
 MAX_STEP = 0.3
 """rad; longest step of a joint in one iteration."""
 
 POSTURE_COST = 1e-4
-"""Against position and orientation costs of 1: decides only the null space and, at
+"""Against position and orientation costs of 1: it decides only the null space and, at
 unreachable poses, keeps the arm near its start."""
-
-
-@dataclasses.dataclass(frozen=True)
-class IkResult:
-  """A configuration and how far its tool is from the pose asked for."""
-
-  q: np.ndarray  # f64[6], rad
-  position_residual: float  # m
-  rotation_residual: float  # rad
-
-  @property
-  def reached(self) -> bool:
-    """Within 1 mm and 0.5 degrees."""
-    return (
-      self.position_residual < POSITION_TOLERANCE
-      and self.rotation_residual < ROTATION_TOLERANCE
-    )
 
 
 class IkSolver:
@@ -51,18 +31,23 @@ class IkSolver:
     model = mujoco.MjModel.from_xml_path(str(mjcf_path("robot")))
     self._configuration = mink.Configuration(model)
     self._pose = mink.FrameTask(
-      TOOL_SITE, "site", position_cost=1.0, orientation_cost=1.0, lm_damping=1e-6
+      "tool", "site", position_cost=1.0, orientation_cost=1.0, lm_damping=1e-6
     )
     self._posture = mink.PostureTask(model, cost=POSTURE_COST)
     self._limits = [mink.ConfigurationLimit(model)]
 
-  def solve(self, start: np.ndarray, pos: np.ndarray, mat: np.ndarray) -> IkResult:
-    """Configuration nearest to ``start`` that puts the tool at a pose.
+  def solve(
+    self, start: np.ndarray, pos: np.ndarray, mat: np.ndarray
+  ) -> tuple[np.ndarray, np.ndarray]:
+    """Finds the configuration nearest to ``start`` that puts the tool at a pose.
 
     Args:
       start: f64[6], rad; also the preferred posture.
       pos: f64[3], tool position in the world frame, m.
       mat: f64[3, 3], tool rotation in the world frame.
+
+    Returns:
+      f64[6] configuration (rad) and f64[2] residuals of the pose (m and rad).
     """
     configuration = self._configuration
     q = np.zeros(configuration.model.nq)
@@ -73,9 +58,10 @@ class IkSolver:
     self._pose.set_target(
       mink.SE3.from_rotation_and_translation(rotation, np.asarray(pos, np.float64))
     )
+    residuals = np.zeros(2)
     for _ in range(MAX_ITERATIONS):
       error = self._pose.compute_error(configuration)
-      residuals = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
+      residuals[:] = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
       if residuals[0] < 1e-5 and residuals[1] < 1e-4:
         break
       # A unit step with a unit time constant: one Gauss-Newton step per iteration.
@@ -87,16 +73,16 @@ class IkSolver:
         damping=1e-9,
         limits=self._limits,
       )
-      # Longer steps would leap over to another branch of the arm's configurations.
+      # Longer steps could reach another branch of the arm's configurations.
       longest = max(float(np.abs(velocity).max()), 1e-9)
       configuration.integrate_inplace(velocity, min(1.0, MAX_STEP / longest))
-    return IkResult(configuration.q[: len(start)].copy(), *map(float, residuals))
+    return configuration.q[: len(start)].copy(), residuals
 
 
 def solve_all(
   starts: np.ndarray, positions: np.ndarray, rotations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-  """Solves the targets of many states, as the work of one process.
+  """Solves the targets of many states in this process.
 
   Args:
     starts: f64[n, 6], rad.
@@ -107,12 +93,11 @@ def solve_all(
     f64[n, k, 6] targets (rad) and f64[n, k, 2] residuals (m and rad).
   """
   solver = IkSolver()
-  results = [
-    [solver.solve(start, pos, mat) for pos, mat in zip(p, r, strict=True)]
-    for start, p, r in zip(starts, positions, rotations, strict=True)
+  solved = [
+    solver.solve(start, *pose)
+    for start, *poses in zip(starts, positions, rotations, strict=True)
+    for pose in zip(*poses, strict=True)
   ]
-  q = np.array([[result.q for result in row] for row in results])
-  residuals = np.array(
-    [[(x.position_residual, x.rotation_residual) for x in row] for row in results]
-  )
-  return q, residuals
+  q, residuals = map(np.array, zip(*solved, strict=True))
+  batch = positions.shape[:2]
+  return q.reshape(*batch, -1), residuals.reshape(*batch, -1)

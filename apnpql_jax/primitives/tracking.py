@@ -1,8 +1,8 @@
-"""Action primitives inside jit: keep their joint targets and follow them.
+"""Action primitives inside jit: update their joint targets and follow them.
 
-A primitive is the velocity that leads from the present to a target configuration
-(paper Sec. IV-A). mink solves the targets of every reset state (``bank``); from
-there a few damped least-squares steps per control period keep up with the scene.
+A primitive is the velocity from the present to a target configuration (paper
+Sec. IV-A). mink solves the targets of every reset state (``reset_bank``); from there a
+few damped least-squares steps per control period track the moving scene.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ GAIN = 2.0
 """1/s, close to the target."""
 
 BRAKING = 0.7
-"""rad/s^2, far from it: v = sqrt(2 a d) stops within d. Less than the limit of 1.2,
+"""rad/s^2, far from the target: v = sqrt(2 a d) stops within d. Below the limit of 1.2
 because a command is held for 0.15 s. Without this profile a gain of 2.0 overshoots
-by 0.06 rad from full speed, and only 1.7 would not."""
+by 0.06 rad from full speed; the largest gain that does not is 1.7."""
 
 DAMPING = 1e-3
-"""m or rad; small against the Jacobian's singular values in the workspace."""
+"""m or rad; small compared to the Jacobian's singular values in the workspace."""
 
 REFINE_STEPS = 4
-"""Newton steps per control period; two bring a 10 cm jump to below 1 mm."""
+"""Newton steps per control period; two reduce a jump of 10 cm to below 1 mm."""
 
 MAX_REFINEMENT = 0.3
 """rad; longest joint step of one iteration, a trust region near singularities."""
 
 
 def follow(target: Array, q: Array) -> Array:
-  """Velocity towards a target, scaled as a whole into the velocity limit.
+  """Returns the velocity towards a target; all joints are scaled by the same factor.
 
   Args:
     target: f32[*b, 6], joint angles, rad.
@@ -54,9 +54,9 @@ def refine(
 ) -> Array:
   """Moves joint targets towards tool poses by damped least squares.
 
-  Starts from the last target, or from the present configuration where that is nearer
-  to the pose: after a jump of the pose, such as when an object has been grasped, the
-  steps from afar could end in another branch of the arm's configurations.
+  Starts from the last target, or from the present configuration if that is nearer to
+  the pose. After a jump of the pose, as when an object has been grasped, steps from a
+  distant start could end in another branch of the arm's configurations.
 
   Args:
     chain: the arm.

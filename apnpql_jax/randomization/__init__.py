@@ -1,1 +1,1 @@
-"""Domain randomisation: every episode has a world of its own (paper Sec. V-C)."""
+"""Domain randomization: every episode has a world of its own (paper Sec. V-C)."""

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from apnpql_jax.config import RandomizationConfig
+from apnpql_jax.config.ranges import RandomizationConfig
 from apnpql_jax.render import Lighting
+from apnpql_jax.sim.scene import free_joints
 from apnpql_jax.types import Array
 
 
@@ -47,7 +48,7 @@ class World:
     self.fields = dict(fields)
 
   def __getitem__(self, name: str) -> Array:
-    """A model field or the colour of the background, f32[...]."""
+    """A model field or the color of the background, f32[...]."""
     value = self.fields.get(name)
     if value is None:
       plain = Lighting() if name == "background" else self.model
@@ -60,6 +61,4 @@ class World:
 
 def free_bodies(model: mujoco.MjModel) -> np.ndarray:
   """bool[nbody]: the bodies that float freely."""
-  joint = model.body_jntadr
-  kind = np.append(model.jnt_type, -1)[joint]  # Without a joint the address is -1.
-  return kind == mujoco.mjtJoint.mjJNT_FREE
+  return np.isin(np.arange(model.nbody), model.jnt_bodyid[free_joints(model)])

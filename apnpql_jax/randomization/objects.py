@@ -74,7 +74,7 @@ def weigh(draw: Draw, world: World) -> None:
 
 
 def derive(world: World) -> None:
-  """What MuJoCo derives from mass, inertia and centre of the bodies that float freely.
+  """What MuJoCo derives from mass, inertia and center of the bodies that float freely.
 
   A free joint moves along three axes, then turns about three. Axes of inertia are those
   of the body.

@@ -1,4 +1,4 @@
-"""Images of primitive scenes: a pure-JAX ray caster and the writing of videos."""
+"""Images of scenes made of primitives: a pure-JAX ray caster."""
 
 from apnpql_jax.render.geoms import CameraSpec, Geoms, Lighting
 from apnpql_jax.render.raycast import Image, render

@@ -1,7 +1,7 @@
 """Static description of what the ray caster draws: geoms, cameras and light.
 
-Everything here is numpy or plain Python, read once from a ``mujoco.MjModel`` and
-closed over by the compiled program; only poses are arguments of it.
+Everything here is NumPy or plain Python, read once from a ``mujoco.MjModel`` and
+constant in the compiled program, whose only arguments are poses and fields.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from apnpql_jax.config import ConfigError
+from apnpql_jax.errors import ConfigError
 
 _TYPES = mujoco.mjtGeom
 SUPPORTED = (
@@ -23,28 +23,22 @@ SUPPORTED = (
   _TYPES.mjGEOM_BOX,
   _TYPES.mjGEOM_CYLINDER,
 )
-"""Geom types that have a closed-form intersection here."""
+"""Geom types with a closed-form intersection in ``intersect``."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Geoms:
-  """The visible geoms of a model. Hashed by identity, so that it may be static.
+  """The n visible geoms of a model, ordered by type and then by MuJoCo id.
 
-  ``n`` geoms are drawn, ordered by type and then by MuJoCo id.
+  Hashed by identity, so that it can be a static argument.
   """
 
-  ids: np.ndarray
-  """i32[n]: MuJoCo geom ids."""
-  types: np.ndarray
-  """i32[n]: ``mujoco.mjtGeom``, sorted."""
-  sizes: np.ndarray
-  """f32[n, 3]: MuJoCo half sizes in metres."""
-  colors: np.ndarray
-  """f32[n, 3]: red, green, blue in [0, 1]. Every visible geom is drawn opaque."""
-  checker: np.ndarray
-  """f32[n]: edge of a checker's squares in metres, 0 for a plain geom."""
-  checker_colors: np.ndarray
-  """f32[n, 3]: colour of the squares where floor(x) + floor(y) is odd."""
+  ids: np.ndarray  # i32[n]: MuJoCo geom ids
+  types: np.ndarray  # i32[n]: ``mujoco.mjtGeom``, sorted
+  sizes: np.ndarray  # f32[n, 3]: MuJoCo half sizes, m
+  colors: np.ndarray  # f32[n, 3]: RGB in [0, 1]; every visible geom is drawn opaque
+  checker: np.ndarray  # f32[n]: edge of a checker's squares, m; 0 for a plain geom
+  checker_colors: np.ndarray  # f32[n, 3]: of squares where floor(x) + floor(y) is odd
 
   @classmethod
   def from_model(
@@ -54,10 +48,7 @@ class Geoms:
 
     Args:
       model: compiled MuJoCo model.
-      groups: geom groups to draw; the default is what MuJoCo's viewer draws.
-
-    Returns:
-      The static description.
+      groups: geom groups to draw; the default is that of MuJoCo's viewer.
 
     Raises:
       ConfigError: a visible geom has a type without closed-form intersection, or a
@@ -67,11 +58,11 @@ class Geoms:
     visible = (rgba[:, 3] > 0) & np.isin(model.geom_group, groups)
     ids = np.flatnonzero(visible)
     ids = ids[np.argsort(model.geom_type[ids], kind="stable")]
-    _refuse_unsupported(model, ids)
     colors, odd_colors = rgba[ids, :3].copy(), np.zeros((len(ids), 3))
     checker = np.zeros(len(ids))
     for k, i in enumerate(ids):
       texture = _texture_id(model, i)
+      _check_drawable(model, i, texture)
       if texture >= 0:
         checker[k], even, odd = _read_checker(model, i, texture)
         colors[k], odd_colors[k] = colors[k] * even, colors[k] * odd
@@ -85,7 +76,7 @@ class Geoms:
     )
 
   def rows(self, ids: Sequence[int], types: Container[int]) -> list[int]:
-    """Rows of the geoms that take part in shadows.
+    """Returns the rows of geoms, given by MuJoCo id, that take part in shadows.
 
     Raises:
       ValueError: a geom is not drawn or its type is not one of ``types``.
@@ -94,7 +85,7 @@ class Geoms:
     wrong = [i for i in ids if i not in rows]
     if wrong:
       raise ValueError(
-        f"geoms {wrong} cannot take part in shadows; these can: {sorted(rows)}"
+        f"geoms {wrong} cannot take part in shadows; valid: {sorted(rows)}"
       )
     return [rows[i] for i in ids]
 
@@ -105,12 +96,9 @@ class CameraSpec:
 
   name: str
   id: int
-  height: int
-  """Pixels."""
-  width: int
-  """Pixels; they are square, so the width sets the horizontal field of view."""
-  fovy_deg: float
-  """Vertical field of view in degrees, as in MJCF."""
+  height: int  # pixels
+  width: int  # pixels; they are square, so it sets the horizontal field of view
+  fovy_deg: float  # vertical field of view in degrees, as in MJCF
 
   @classmethod
   def from_model(
@@ -124,7 +112,7 @@ class CameraSpec:
     """
     names = [model.camera(i).name for i in range(model.ncam)]
     if name not in names:
-      raise ConfigError(f"no camera {name!r} in the model; it has {names}")
+      raise ConfigError(f"no camera {name!r} in the model (valid: {names})")
     if height < 1 or width < 1:
       raise ConfigError(f"image of camera {name!r} is empty: {height}x{width}")
     i = names.index(name)
@@ -145,31 +133,30 @@ class Lighting:
   direction: tuple[float, float, float] = (0.3, 0.4, -1.0)
   """World direction in which the light travels; need not be a unit vector."""
   ambient: float = 0.35
-  """Intensity in the dark."""
+  """Intensity without the light."""
   diffuse: float = 0.65
-  """Intensity added where the light falls in straight."""
+  """Intensity added at normal incidence."""
   fill: float = 0.3
-  """Share of ``diffuse`` seen by surfaces turned straight away from the light;
-  without it they would all have one flat colour."""
+  """Share of ``diffuse`` on surfaces that face straight away from the light; without
+  it they would all have one flat color."""
   background: tuple[float, float, float] = (0.55, 0.65, 0.75)
-  """Colour of rays that hit nothing, in [0, 1]."""
+  """Color of rays that hit nothing, in [0, 1]."""
   shadow_casters: tuple[int, ...] = ()
-  """MuJoCo ids of the spheres, capsules and boxes that throw hard shadows. Empty
+  """MuJoCo ids of the spheres, capsules and boxes that cast hard shadows. Empty
   means no shadows and no cost."""
   shadow_receivers: tuple[int, ...] = ()
-  """MuJoCo ids of the geoms on which shadows fall. As seen from the light, every
-  receiver must lie behind every caster: a table under a gripper."""
+  """MuJoCo ids of the geoms on which shadows fall. Seen from the light, every
+  receiver must lie behind every caster, as a table lies under a gripper."""
   shadow: float = 0.4
-  """Share of the intensity that a shadow takes away."""
-
+  """Share of the intensity that a shadow removes."""
   id: int = 0
-  """MuJoCo id of the light, for where it differs between worlds."""
+  """MuJoCo id of the light, for fields that differ between worlds."""
 
   def __post_init__(self):
     shares = (self.ambient, self.diffuse, self.fill, self.shadow, *self.background)
     if any(not 0.0 <= x <= 1.0 for x in shares) or self.ambient + self.diffuse > 1.0:
       raise ValueError(
-        "light intensities must lie in [0, 1] and ambient + diffuse must not pass 1, "
+        "light intensities must lie in [0, 1] and ambient + diffuse must not exceed 1, "
         f"got {self}"
       )
     if not np.any(self.direction):
@@ -187,7 +174,7 @@ class Lighting:
 
     Raises:
       ConfigError: the model does not have exactly one directional light, or the
-        light is fixed to a moving body.
+        light is attached to a body.
     """
     lights = np.flatnonzero(model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     if len(lights) != 1 or model.light_bodyid[lights[0]] != 0:
@@ -197,7 +184,7 @@ class Lighting:
 
 
 def _effective_rgba(model: mujoco.MjModel) -> np.ndarray:
-  """f32[ngeom, 4]: as MuJoCo's viewer does, a material counts where rgba is default."""
+  """Returns f32[ngeom, 4]: as in MuJoCo, a material replaces only the default rgba."""
   rgba = model.geom_rgba.copy()
   default = np.all(rgba == np.array([0.5, 0.5, 0.5, 1.0], rgba.dtype), axis=1)
   use_material = (model.geom_matid >= 0) & default
@@ -205,15 +192,17 @@ def _effective_rgba(model: mujoco.MjModel) -> np.ndarray:
   return rgba
 
 
-def _refuse_unsupported(model: mujoco.MjModel, ids: np.ndarray) -> None:
-  for i in ids:
-    kind = _TYPES(int(model.geom_type[i]))
-    name = model.geom(i).name or f"geom {i}"
-    if kind not in SUPPORTED:
-      valid = ", ".join(t.name for t in SUPPORTED)
-      raise ConfigError(f"cannot draw {name!r}: {kind.name} is none of {valid}")
-    if _texture_id(model, i) >= 0 and kind != _TYPES.mjGEOM_PLANE:
-      raise ConfigError(f"cannot draw the texture of {name!r}: only planes have one")
+def _check_drawable(model: mujoco.MjModel, geom_id: int, texture: int) -> None:
+  kind, name = _TYPES(int(model.geom_type[geom_id])), _geom_name(model, geom_id)
+  if kind not in SUPPORTED:
+    valid = ", ".join(t.name for t in SUPPORTED)
+    raise ConfigError(f"cannot draw {name!r}: {kind.name} (valid: {valid})")
+  if texture >= 0 and kind != _TYPES.mjGEOM_PLANE:
+    raise ConfigError(f"cannot draw the texture of {name!r}: it is not on a plane")
+
+
+def _geom_name(model: mujoco.MjModel, geom_id: int) -> str:
+  return model.geom(geom_id).name or f"geom {geom_id}"
 
 
 def _texture_id(model: mujoco.MjModel, geom_id: int) -> int:
@@ -226,7 +215,7 @@ def _texture_id(model: mujoco.MjModel, geom_id: int) -> int:
 def _read_checker(
   model: mujoco.MjModel, geom_id: int, texture: int
 ) -> tuple[float, np.ndarray, np.ndarray]:
-  """Edge in metres and the colours of even and odd squares of a checkered plane."""
+  """Returns a checker's edge (m) and the colors of its even and odd squares."""
   height, width = model.tex_height[texture], model.tex_width[texture]
   channels, start = model.tex_nchannel[texture], model.tex_adr[texture]
   data = model.tex_data[start : start + height * width * channels]
@@ -235,10 +224,10 @@ def _read_checker(
   row, column = np.arange(height) * 2 // height, np.arange(width) * 2 // width
   expected = np.where(((row[:, None] + column) % 2 == 0)[..., None], odd, even)
   material = model.geom_matid[geom_id]
-  repeat = model.mat_texrepeat[material]
   size = model.geom_size[geom_id, :2]
-  scale = np.where((size > 0) & ~model.mat_texuniform[material], size, 1.0) / repeat
+  scale = np.where((size > 0) & ~model.mat_texuniform[material], size, 1.0)
+  scale = scale / model.mat_texrepeat[material]
   if not np.array_equal(data, expected) or scale[0] != scale[1]:
-    name = model.geom(geom_id).name or f"geom {geom_id}"
+    name = _geom_name(model, geom_id)
     raise ConfigError(f"cannot draw the texture of {name!r}: not a square checker")
   return float(scale[0]), even / 255.0, odd / 255.0

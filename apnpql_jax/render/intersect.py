@@ -1,16 +1,16 @@
-"""Where a camera ray first enters a primitive, in closed form.
+"""Closed-form intersections of camera rays with primitives.
 
-All rays of an image start at the camera, so they are ``t * (u, v, -1)`` in the
-camera's frame, and ``t`` is the depth. What depends on the geom alone is computed
-once per image (``prepare``); the ``*_hit`` functions do the arithmetic per pixel for
-one geom. They return the depth and the cosine between outward normal and light. A
-ray that misses has depth ``MISS``; where the geom lies behind the camera or around it
-the depth is negative, and the caller drops it.
+All rays of an image start at the camera: they are ``t * (u, v, -1)`` in its frame, and
+``t`` is the depth. ``prepare`` computes once per image what depends on the geom alone;
+the ``*_hit`` functions do the arithmetic per pixel for one geom. They return the depth
+and the cosine between outward normal and light. A ray that misses has depth ``MISS``.
+If the geom is behind or around the camera, the depth is negative; the caller drops it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+import functools
 from typing import NamedTuple
 
 import jax
@@ -18,13 +18,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-Array = jax.Array
+from apnpql_jax.types import Array
 
 MISS = 1e30
-"""Depth of a ray that hits nothing; finite, so that no arithmetic makes NaN of it."""
+"""Depth of a ray that hits nothing; finite, so that no arithmetic turns it into NaN."""
 
-_TINY = 1e-12
-_NUDGE = 1e-7  # rad; turns a ray off a cylinder's axis, where its equation is 0 / 0
+TINY = 1e-12  # avoids division by zero
+_NUDGE = 1e-7  # turns rays off a cylinder's axis, where its equation is 0 / 0
 
 
 class Rays(NamedTuple):
@@ -37,7 +37,7 @@ class Rays(NamedTuple):
 
 
 class Frames(NamedTuple):
-  """What the intersections need to know of n geoms; of one geom without the n."""
+  """Inputs of the intersections with n geoms; without the leading n for one geom."""
 
   x: Array  # f32[n, 3]: axes of the geom in the camera's frame
   y: Array  # f32[n, 3]
@@ -45,14 +45,14 @@ class Frames(NamedTuple):
   center: Array  # f32[n, 3]: in the camera's frame, m
   offset: Array  # f32[n, 3]: the same in the geom's own frame, m
   light: Array  # f32[n, 3]: unit vector towards the light in the geom's own frame
-  center_light: Array  # f32[n]: inner product of centre and light, m
-  center_norm2: Array  # f32[n]: squared distance of the centre, m^2
+  center_light: Array  # f32[n]: inner product of center and light, m
+  center_norm2: Array  # f32[n]: squared distance of the center, m^2
   size: Array  # f32[n, 3]: MuJoCo half sizes, m
-  inv_radius: Array  # f32[n]: 1 / size[0], of use where that is a radius
+  inv_radius: Array  # f32[n]: 1 / size[0], for geoms where that is a radius
 
 
 def make_rays(height: int, width: int, fovy_deg: float) -> Rays:
-  """Rays through the pixel centres, row by row from the upper left."""
+  """Returns the rays through the pixel centers, row by row from the upper left."""
   pixel = 2.0 * np.tan(np.radians(fovy_deg) / 2.0) / height
   x = (np.arange(width) + 0.5 - width / 2.0) * pixel
   y = (height / 2.0 - np.arange(height) - 0.5) * pixel
@@ -61,31 +61,28 @@ def make_rays(height: int, width: int, fovy_deg: float) -> Rays:
   return Rays(*(a.astype(np.float32) for a in (u, v, norm2, 1.0 / norm2)))
 
 
-def zoomed(rays: Rays, zoom: Array) -> Rays:
-  """The same pixels of a camera whose image is ``zoom`` times as wide at unit depth."""
+def zoom_rays(rays: Rays, zoom: Array) -> Rays:
+  """Returns the rays of a camera whose view is ``zoom`` times as wide at unit depth."""
   u, v = rays.u * zoom, rays.v * zoom
   norm2 = u * u + v * v + 1.0
   return Rays(u, v, norm2, 1.0 / norm2)
 
 
 def along(w: Array, rays: Rays) -> Array:
-  """f32[P]: inner product of a vector f32[3] with every ray direction."""
+  """Returns the inner products f32[P] of a vector f32[3] with all ray directions."""
   return w[0] * rays.u + w[1] * rays.v - w[2]
 
 
 def prepare(
   center: Array, axes: Array, size: Array | np.ndarray, to_light: Array
 ) -> Frames:
-  """Per-geom part of the intersections.
+  """Computes the per-geom part of the intersections.
 
   Args:
     center: f32[n, 3], geom positions in the camera's frame.
     axes: f32[n, 3, 3], their rotations; the columns are the geoms' axes.
     size: f32[n, 3], MuJoCo half sizes.
     to_light: f32[3], unit vector towards the light in the camera's frame.
-
-  Returns:
-    The frames, every field with a leading n.
   """
   # Sums, not einsum: XLA's CPU backend would call a library for each tiny product.
   return Frames(
@@ -98,57 +95,54 @@ def prepare(
     center_light=(center * to_light[None]).sum(axis=1),
     center_norm2=(center * center).sum(axis=1),
     size=jnp.asarray(size),
-    inv_radius=1.0 / jnp.maximum(size[:, 0], _TINY),
+    inv_radius=1.0 / jnp.maximum(size[:, 0], TINY),
   )
 
 
 def row(frames: Frames, k: int) -> Frames:
-  """The frame of geom k alone."""
+  """Returns the frame of geom k alone."""
   return Frames(*(field[k] for field in frames))
 
 
 def plane_hit(g: Frames, rays: Rays, ray_light: Array) -> tuple[Array, Array]:
-  """A plane, seen from its front only; rectangular where its sizes are positive."""
+  """Intersects the front of a plane, which is bounded where its sizes are positive."""
   del ray_light
   toward = along(g.z, rays)
   t = g.offset[2] / toward
   x, y = plane_point(g, rays, t)
-  inside = (jnp.abs(x) <= _extent(g.size[0])) & (jnp.abs(y) <= _extent(g.size[1]))
+  width, height = (jnp.where(g.size[k] > 0.0, g.size[k], MISS) for k in range(2))
+  inside = (jnp.abs(x) <= width) & (jnp.abs(y) <= height)
   hit = (toward < 0.0) & inside
   return jnp.where(hit, t, MISS), g.light[2]
 
 
-def _extent(size: Array) -> Array:
-  return jnp.where(size > 0.0, size, MISS)
-
-
 def plane_point(g: Frames, rays: Rays, t: Array) -> tuple[Array, Array]:
-  """f32[P] twice: coordinates on the plane of the points at depth t."""
+  """Returns x and y on the plane, f32[P] each, of the points at depth t."""
   return t * along(g.x, rays) - g.offset[0], t * along(g.y, rays) - g.offset[1]
 
 
 def sphere_hit(g: Frames, rays: Rays, ray_light: Array) -> tuple[Array, Array]:
-  """A sphere of radius size[0]."""
+  """Intersects a sphere of radius size[0]."""
   radius = g.size[0]
   t, found = _ball(along(g.center, rays), g.center_norm2 - radius * radius, rays)
   return jnp.where(found, t, MISS), (t * ray_light - g.center_light) * g.inv_radius
 
 
 def _ball(b: Array, c: Array, rays: Rays) -> tuple[Array, Array]:
-  """Smaller root of norm2 t^2 - 2 b t + c = 0, and whether there is one."""
+  """Returns the smaller root of norm2 t^2 - 2 b t + c = 0, and whether it exists."""
   discriminant = b * b - rays.norm2 * c
   root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
   return (b - root) * rays.inv_norm2, discriminant > 0.0
 
 
 def ellipsoid_hit(g: Frames, rays: Rays, ray_light: Array) -> tuple[Array, Array]:
-  """An ellipsoid of half axes size, which is a ball where these measure lengths."""
+  """Intersects an ellipsoid of half axes size: a unit ball after scaling by them."""
   del ray_light
-  inv = 1.0 / jnp.maximum(g.size, _TINY)
+  inv = 1.0 / jnp.maximum(g.size, TINY)
   x, y, z = (along(axis, rays) * inv[k] for k, axis in enumerate((g.x, g.y, g.z)))
   p, q, r = (g.offset[k] * inv[k] for k in range(3))
   a, b = x * x + y * y + z * z, x * p + y * q + z * r
-  # As of a tube, by a cross product.
+  # Distance of ray and center by a cross product, as in ``_tube``.
   cross = (y * r - z * q, z * p - x * r, x * q - y * p)
   discriminant = a - (cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2])
   t = (b - jnp.sqrt(jnp.maximum(discriminant, 0.0))) / a
@@ -159,17 +153,16 @@ def ellipsoid_hit(g: Frames, rays: Rays, ray_light: Array) -> tuple[Array, Array
 
 
 def _tube(g: Frames, rays: Rays) -> tuple[Array, Array, Array, Array, Array, Array]:
-  """Entry and exit of the infinite cylinder of radius size[0] along the geom's z.
+  """Intersects the infinite cylinder of radius size[0] along the geom's z.
 
   Returns:
-    Entry, exit, whether it is hit at all, then what a capsule shares: inner product
-    of transverse direction and offset, axial direction, and axial entry point
-    measured from the centre.
+    Entry, exit, whether it is hit, inner product of transverse direction and offset,
+    axial direction, and axial entry point measured from the center.
   """
   dx, dy, dz = along(g.x, rays) + _NUDGE, along(g.y, rays), along(g.z, rays)
   inv_a = 1.0 / (dx * dx + dy * dy)
   b = dx * g.offset[0] + dy * g.offset[1]
-  # Distance of ray and axis by their cross product: b^2 - a c would cancel.
+  # Distance of ray and axis by a cross product: b^2 - a c would lose precision.
   cross = dx * g.offset[1] - dy * g.offset[0]
   discriminant = (dx * dx + dy * dy) * (g.size[0] * g.size[0]) - cross * cross
   root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
@@ -178,10 +171,10 @@ def _tube(g: Frames, rays: Rays) -> tuple[Array, Array, Array, Array, Array, Arr
 
 
 def capsule_hit(g: Frames, rays: Rays, ray_light: Array) -> tuple[Array, Array]:
-  """A capsule of radius size[0] and half length size[1] along z."""
+  """Intersects a capsule of radius size[0] and half length size[1] along z."""
   radius, half = g.size[0], g.size[1]
   t_tube, _, in_tube, b, dz, axial = _tube(g, rays)
-  # Point of the axis whose ball is hit: where the tube is entered, else an end.
+  # Center of the ball that is hit: the axial entry point, clipped to the ends.
   end = jnp.clip(axial, -half, half)
   c = g.center_norm2 - radius * radius + end * (2.0 * g.offset[2] + end)
   t_ball, in_ball = _ball(b + dz * (g.offset[2] + end), c, rays)
@@ -193,9 +186,9 @@ def capsule_hit(g: Frames, rays: Rays, ray_light: Array) -> tuple[Array, Array]:
 
 
 def cylinder_hit(g: Frames, rays: Rays, ray_light: Array) -> tuple[Array, Array]:
-  """A cylinder of radius size[0] and half length size[1] along z."""
+  """Intersects a cylinder of radius size[0] and half length size[1] along z."""
   t_side, exit_side, in_tube, _, dz, _ = _tube(g, rays)
-  t_cap, exit_cap = _slab(dz, g.offset[2], g.size[1])
+  t_cap, exit_cap = slab(dz, g.offset[2], g.size[1])
   t = jnp.maximum(t_side, t_cap)
   hit = in_tube & (t <= jnp.minimum(exit_side, exit_cap))
   axial = t * dz - g.offset[2]
@@ -204,27 +197,26 @@ def cylinder_hit(g: Frames, rays: Rays, ray_light: Array) -> tuple[Array, Array]
   return jnp.where(hit, t, MISS), cosine
 
 
-def _slab(d: Array, offset: Array, half: Array) -> tuple[Array, Array]:
-  """Depths at which a ray enters and leaves |coordinate| <= half."""
-  inv = 1.0 / (d + _TINY)
+def slab(d: Array, offset: Array, half: Array) -> tuple[Array, Array]:
+  """Returns the depths at which a ray enters and leaves |coordinate| <= half."""
+  inv = 1.0 / (d + TINY)
   middle, width = offset * inv, half * jnp.abs(inv)
   return middle - width, middle + width
 
 
 def _facing(d: Array, light: Array) -> Array:
-  """Cosine with the light of whichever of two opposite faces the ray comes upon."""
+  """Returns the cosine with the light on whichever of two opposite faces is hit."""
   return jnp.where(d > 0.0, -light, light)
 
 
 def box_hit(g: Frames, rays: Rays, ray_light: Array) -> tuple[Array, Array]:
-  """A box of half sizes size."""
+  """Intersects a box of half sizes size."""
   del ray_light
   dirs = [along(axis, rays) for axis in (g.x, g.y, g.z)]
-  slabs = [_slab(d, g.offset[k], g.size[k]) for k, d in enumerate(dirs)]
-  enter = [slab[0] for slab in slabs]
-  t = jnp.maximum(jnp.maximum(enter[0], enter[1]), enter[2])
-  leave = jnp.minimum(jnp.minimum(slabs[0][1], slabs[1][1]), slabs[2][1])
-  hit = t <= leave
+  slabs = [slab(d, g.offset[k], g.size[k]) for k, d in enumerate(dirs)]
+  enter, leave = zip(*slabs, strict=True)
+  t = functools.reduce(jnp.maximum, enter)
+  hit = t <= functools.reduce(jnp.minimum, leave)
   face = [_facing(d, g.light[k]) for k, d in enumerate(dirs)]
   cosine = jnp.where(t == enter[0], face[0], jnp.where(t == enter[1], face[1], face[2]))
   return jnp.where(hit, t, MISS), cosine

@@ -1,12 +1,13 @@
 """A pure-JAX ray caster: shaded images, depth and segmentation of primitives.
 
-The layout is what makes it fast on a CPU: for an image, one expression folds over the
-geoms, unrolled, keeping per pixel the smallest depth and one float that carries the
-winner's colour index and its intensity. XLA compiles it to a single vectorised loop
-over pixels that touches memory once, so no batch is too large for the caches. It runs
-inside a ``lax.map`` over blocks of pixels, for the fence that a loop is: without one,
-XLA fuses the fold into what uses it and casts the scene again for each colour channel
-(its CPU backend drops optimization barriers before it fuses).
+The layout makes it fast on a CPU. For an image, one unrolled expression folds over the
+geoms and keeps two floats per pixel: the smallest depth, and the paint of that geom,
+its color index plus its intensity. XLA compiles the fold to a single vectorized loop
+over pixels that touches memory once, so no batch is too large for the caches.
+
+The fold runs inside a ``lax.map`` over blocks of pixels because XLA does not fuse
+across a loop. Otherwise it would fuse the fold into its users and cast the scene again
+for each color channel; its CPU backend drops optimization barriers before it fuses.
 """
 
 from __future__ import annotations
@@ -20,27 +21,26 @@ import jax.numpy as jnp
 import numpy as np
 
 from apnpql_jax.render import intersect, shadow, texture
+from apnpql_jax.render.appearance import FIELDS, Appearance, make_appearance
 from apnpql_jax.render.geoms import CameraSpec, Geoms, Lighting
-from apnpql_jax.render.look import FIELDS, Look, make_look
-
-Array = jax.Array
+from apnpql_jax.types import Array
 
 OUTPUTS = ("rgb", "depth", "segmentation")
 DEFAULT_LIGHTING = Lighting()
 NEAR = 0.005
-"""Default near limit in metres."""
+"""Default near limit in meters."""
 BLOCKS = 4
-"""Blocks of pixels per image; one would be no loop."""
+"""Blocks of pixels per image; with one there would be no loop."""
 
-_FULL = 255.0 / 256.0  # full intensity; below one, for the integer part is the colour
+_FULL = 255.0 / 256.0  # full intensity; below one, as the integer part is the color
 
 
 class Image(struct.PyTreeNode):
-  """What a camera sees; ``None`` where it was not asked for."""
+  """Image of a camera; outputs that were not requested are ``None``."""
 
   rgb: Array | None = None  # u8[*b, H, W, 3]
-  depth: Array | None = None  # f32[*b, H, W]: m along the viewing axis, inf: nothing
-  segmentation: Array | None = None  # i32[*b, H, W]: MuJoCo geom ids, -1: nothing
+  depth: Array | None = None  # f32[*b, H, W]: m along the viewing axis; inf: no hit
+  segmentation: Array | None = None  # i32[*b, H, W]: MuJoCo geom ids; -1: no hit
 
 
 @functools.partial(
@@ -59,29 +59,29 @@ def render(
   outputs: Sequence[str] = OUTPUTS,
   near: float = NEAR,
 ) -> Image:
-  """Casts one ray per pixel through its centre.
+  """Casts one ray per pixel through its center.
 
-  Geoms are opaque; back faces are not drawn, so a camera inside a geom sees through
-  it, as in MuJoCo's renderer. What enters closer than ``near`` is not drawn either.
+  Geoms are opaque. Back faces are not drawn, so a camera inside a geom sees through
+  it, as in MuJoCo's renderer. Geoms hit closer than ``near`` are not drawn either.
 
   Args:
-    geoms: what to draw.
+    geoms: geoms to draw.
     camera: image size and field of view.
     geom_xpos: f32[*b, ngeom, 3], world positions by MuJoCo geom id.
     geom_xmat: f32[*b, ngeom, 3, 3], world rotations by MuJoCo geom id.
     cam_xpos: f32[*b, 3], world position of this camera.
     cam_xmat: f32[*b, 3, 3], world rotation of this camera.
     lighting: light, background, shadows.
-    fields: what differs between worlds, as in ``look.FIELDS``, with leading axes *b.
-    outputs: which of "rgb", "depth", "segmentation" to compute; only these are paid.
-    near: smallest depth drawn, in metres.
+    fields: values per world of some ``appearance.FIELDS``; other names are ignored.
+    outputs: which of "rgb", "depth", "segmentation" to compute.
+    near: smallest depth drawn, in meters.
 
   Returns:
     The image, with the leading axes of the poses.
 
   Raises:
-    ValueError: an output is unknown, the shapes do not fit, a shadow caster is not a
-      drawn sphere, capsule or box, or a shadow receiver is not drawn.
+    ValueError: an output is unknown, the shapes do not match, a shadow caster is not
+      a drawn sphere, capsule or box, or a shadow receiver is not drawn.
   """
   if not outputs or not set(outputs) <= set(OUTPUTS):
     raise ValueError(f"outputs must be some of {OUTPUTS}, got {tuple(outputs)}")
@@ -90,7 +90,7 @@ def render(
   tails = (geom_xpos.shape[-2:], (*geom_xpos.shape[-2:], 3), (3,), (3, 3))
   for pose, tail in zip(poses, tails, strict=True):
     if pose.shape != (*batch, *tail) or tail[-1] != 3:
-      raise ValueError(f"poses do not fit together: {[p.shape for p in poses]}")
+      raise ValueError(f"shapes of the poses do not match: {[p.shape for p in poses]}")
   one = functools.partial(_render_one, geoms, camera, lighting, tuple(outputs), near)
   fields = {k: v for k, v in (fields or {}).items() if k in FIELDS}
   if not batch:
@@ -114,40 +114,39 @@ def _render_one(
   cam_xmat: Array,
   fields: Mapping[str, Array],
 ) -> Image:
-  """One image; arguments as of ``render``, without leading axes."""
+  """Renders one image; see ``render`` for the arguments, here without leading axes."""
   to_camera = cam_xmat[None, :, :]
   center = ((geom_xpos[geoms.ids] - cam_xpos[None])[:, :, None] * to_camera).sum(axis=1)
   axes = (to_camera[..., None] * geom_xmat[geoms.ids][:, :, None, :]).sum(axis=1)
-  look = make_look(geoms, camera, lighting, fields)
+  look = make_appearance(geoms, camera, lighting, fields)
   basis = (look.light[:, :, None] * to_camera).sum(axis=1)
   frames = intersect.prepare(center, axes, look.sizes, basis[2])
 
   blocks = _blocks(camera, look.zoom)
   cast = functools.partial(_cast, geoms, lighting, look, frames, basis, near)
   t = paint = None
-  # A loop each: with two results XLA would not keep the fold in one piece.
+  # A loop for each: with two results XLA would split the fold.
   if "depth" in outputs or look.texture is not None:
     t = jax.lax.map(lambda rays: cast(rays)[0], blocks)
   if "rgb" in outputs or "segmentation" in outputs:
     paint = jax.lax.map(lambda rays: cast(rays)[1], blocks)
     if look.texture is not None:
-      draw = functools.partial(texture.textured, frames, look.texture, cam_xmat)
-      paint = jax.lax.map(lambda seen: draw(*seen), (blocks, t, paint))
-  depth = t if "depth" in outputs else None
-  return _develop(geoms, camera, look.palette, outputs, depth, paint)
+      draw = functools.partial(texture.apply_texture, frames, look.texture, cam_xmat)
+      paint = jax.lax.map(lambda block: draw(*block), (blocks, t, paint))
+  return _make_image(geoms, camera, look.palette, outputs, t, paint)
 
 
 def _blocks(camera: CameraSpec, zoom: Array | None) -> intersect.Rays:
-  """The rays of an image, f32[BLOCKS, P / BLOCKS]; the last block may be padded."""
+  """Returns the rays f32[BLOCKS, P / BLOCKS]; the last block may be padded."""
   rays = intersect.make_rays(camera.height, camera.width, camera.fovy_deg)
   padding = -rays.u.size % BLOCKS
   rays = jax.tree.map(
     lambda x: jnp.asarray(np.pad(x, (0, padding), "edge").reshape(BLOCKS, -1)), rays
   )
-  return rays if zoom is None else intersect.zoomed(rays, zoom)
+  return rays if zoom is None else intersect.zoom_rays(rays, zoom)
 
 
-def _develop(
+def _make_image(
   geoms: Geoms,
   camera: CameraSpec,
   palette: Array | np.ndarray,
@@ -155,11 +154,11 @@ def _develop(
   t: Array | None,
   paint: Array | None,
 ) -> Image:
-  """Turns the blocks' depth and paint into the wanted outputs."""
+  """Converts depth and paint of all blocks to the requested outputs."""
   shape = (camera.height, camera.width)
   pixels = camera.height * camera.width
   depth = rgb = segmentation = None
-  if t is not None:
+  if "depth" in outputs and t is not None:
     t = t.reshape(-1)[:pixels]
     depth = jnp.where(t < intersect.MISS, t, jnp.inf).reshape(shape)
   if paint is not None:
@@ -179,16 +178,16 @@ def _develop(
 def _cast(
   geoms: Geoms,
   lighting: Lighting,
-  look: Look,
+  look: Appearance,
   frames: intersect.Frames,
   basis: Array,
   near: float,
   rays: intersect.Rays,
 ) -> tuple[Array, Array]:
-  """Depth and paint of the first hit of every ray.
+  """Finds the first hit of every ray.
 
   Returns:
-    f32[P] depth, ``intersect.MISS`` where nothing is hit, and f32[P] paint, whose
+    f32[P] depth, ``intersect.MISS`` if the ray hits nothing, and f32[P] paint, whose
     integer part is the palette's index and whose fraction is the intensity.
   """
   ray_light = intersect.along(basis[2], rays)
@@ -206,39 +205,25 @@ def _cast(
     t = jnp.where(closer, t_k, t)
     paint = jnp.where(closer, index + _intensity(lighting, look, cosine), paint)
   if lighting.shadow_casters:
-    paint = _darken(geoms, lighting, look, frames, basis, rays, t, paint)
+    dark = shadow.darkness(geoms, lighting.shadow_casters, frames, rays, t, basis)
+    index = jnp.floor(paint)
+    receives = jnp.zeros(t.shape, bool)
+    for k in geoms.rows(lighting.shadow_receivers, intersect.HITS):
+      receives = receives | (index == float(k))
+      if geoms.checker[k] > 0.0:
+        receives = receives | (index == float(k + len(geoms.ids) + 1))
+    dimmed = index + (1.0 - lighting.shadow) * (paint - index)
+    paint = jnp.where(dark & receives, dimmed, paint)
   return t, paint
 
 
 def nothing(geoms: Geoms) -> float:
-  """Paint of rays that hit none of the geoms."""
+  """Returns the paint of rays that hit none of the geoms."""
   return len(geoms.ids) + _FULL
 
 
-def _intensity(lighting: Lighting, look: Look, cosine: Array) -> Array:
-  """In [0, 255/256]; ``lighting`` documents the formula."""
+def _intensity(lighting: Lighting, look: Appearance, cosine: Array) -> Array:
+  """Returns the intensity in [0, 255/256], by the formula of ``Lighting``."""
   lit = jnp.maximum(cosine, -lighting.fill * cosine)
   full = _FULL * (look.ambient + look.diffuse * lit)
-  return jnp.minimum(full, _FULL)  # rounding may make a cosine pass one
-
-
-def _darken(
-  geoms: Geoms,
-  lighting: Lighting,
-  look: Look,
-  frames: intersect.Frames,
-  basis: Array,
-  rays: intersect.Rays,
-  t: Array,
-  paint: Array,
-) -> Array:
-  """f32[P]: paint after the shadows have fallen."""
-  dark = shadow.darkness(geoms, lighting.shadow_casters, frames, rays, t, basis)
-  index = jnp.floor(paint)
-  receives = jnp.zeros(t.shape, bool)
-  for k in geoms.rows(lighting.shadow_receivers, intersect.HITS):
-    receives = receives | (index == float(k))
-    if geoms.checker[k] > 0.0:
-      receives = receives | (index == float(k + len(geoms.ids) + 1))
-  dimmed = index + (1.0 - lighting.shadow) * (paint - index)
-  return jnp.where(dark & receives, dimmed, paint)
+  return jnp.minimum(full, _FULL)  # rounding may push a cosine above one

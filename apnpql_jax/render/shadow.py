@@ -1,30 +1,27 @@
 """Hard shadows of chosen geoms on chosen others, under a directional light.
 
-The light's rays are parallel, so a point is in the shadow of a capsule where the two
-are close after projection along the light: no root is needed. That the caster is
-between light and point is taken for granted.
+The light's rays are parallel, so a point is in the shadow of a capsule if the two are
+close after projection along the light: no root is needed. The tests assume that the
+caster is between light and point.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+import functools
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from apnpql_jax.render.geoms import Geoms
-from apnpql_jax.render.intersect import Frames, Rays, along, row
-
-Array = jax.Array
-
-_TINY = 1e-12
+from apnpql_jax.render.intersect import TINY, Frames, Rays, along, row, slab
+from apnpql_jax.types import Array
 
 
 def light_basis(direction: Any, xp: Any = np) -> Any:
-  """f32[3, 3]: rows e1, e2 across the light and l towards it, in world axes.
+  """Returns f32[3, 3]: rows e1, e2 across the light and l towards it, in world axes.
 
   Args:
     direction: [3], in which the light travels.
@@ -39,7 +36,7 @@ def light_basis(direction: Any, xp: Any = np) -> Any:
 
 
 def capsule_shadow(g: Frames, rays: Rays, t: Array, basis: Array) -> Array:
-  """bool[P]: whether a capsule (or a sphere, with half length 0) darkens a point.
+  """Returns whether a capsule, or a sphere with half length 0, darkens each point.
 
   Args:
     g: the caster.
@@ -48,11 +45,12 @@ def capsule_shadow(g: Frames, rays: Rays, t: Array, basis: Array) -> Array:
     basis: f32[3, 3], ``light_basis`` in the camera's frame.
 
   Returns:
-    True where the line along the light meets the caster.
+    bool[P]: the line along the light meets the caster.
   """
+  # Distance of the projected point from the projected axis.
   axis = [(g.z * basis[k]).sum() for k in range(2)]
   center = [(g.center * basis[k]).sum() for k in range(2)]
-  inv = 1.0 / (axis[0] * axis[0] + axis[1] * axis[1] + _TINY)
+  inv = 1.0 / (axis[0] * axis[0] + axis[1] * axis[1] + TINY)
   x, y = (t * along(basis[k], rays) - center[k] for k in range(2))
   s = jnp.clip((x * axis[0] + y * axis[1]) * inv, -g.size[1], g.size[1])
   x, y = x - s * axis[0], y - s * axis[1]
@@ -60,18 +58,14 @@ def capsule_shadow(g: Frames, rays: Rays, t: Array, basis: Array) -> Array:
 
 
 def box_shadow(g: Frames, rays: Rays, t: Array, basis: Array) -> Array:
-  """bool[P]: whether a box darkens a point; arguments as of ``capsule_shadow``."""
+  """Returns whether a box darkens each point; see ``capsule_shadow``."""
   del basis
-  enter, leave = [], []
-  for k, axis in enumerate((g.x, g.y, g.z)):
-    inv = 1.0 / (g.light[k] + _TINY)
-    middle = (g.offset[k] - t * along(axis, rays)) * inv
-    width = g.size[k] * jnp.abs(inv)
-    enter.append(middle - width)
-    leave.append(middle + width)
-  first = jnp.maximum(jnp.maximum(enter[0], enter[1]), enter[2])
-  last = jnp.minimum(jnp.minimum(leave[0], leave[1]), leave[2])
-  return first <= last
+  slabs = [
+    slab(g.light[k], g.offset[k] - t * along(axis, rays), g.size[k])
+    for k, axis in enumerate((g.x, g.y, g.z))
+  ]
+  enter, leave = zip(*slabs, strict=True)
+  return functools.reduce(jnp.maximum, enter) <= functools.reduce(jnp.minimum, leave)
 
 
 SHADOWS: dict[int, Callable[[Frames, Rays, Array, Array], Array]] = {
@@ -90,7 +84,7 @@ def darkness(
   t: Array,
   basis: Array,
 ) -> Array:
-  """bool[P]: whether any of the casters, given by MuJoCo id, darkens a point.
+  """Returns bool[P]: any of the casters, given by MuJoCo id, darkens the point.
 
   Raises:
     ValueError: a caster is not drawn or is not a sphere, capsule or box.

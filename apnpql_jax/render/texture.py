@@ -1,32 +1,31 @@
-"""Procedural textures, computed from where a ray hits a geom.
+"""Procedural textures, computed from the point where a ray hits a geom.
 
-Three waves run through each geom, fixed to it. Where their half waves make an odd sum
-the geom has its other colour, which gives a checker if they run along its axes; and
-their height takes some of its brightness, which gives noise if they do not. The
-background is a sphere of one metre around the camera, fixed to the world.
+Three waves run through each geom and move with it. A point where their numbers of half
+waves have an odd sum has the geom's other color: a checker, if the waves run along its
+axes. The height of the waves removes some of the brightness: noise, if they run in
+other directions. The background is a sphere of one meter around the camera, fixed in
+the world.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 
 from apnpql_jax.render.intersect import MISS, Frames, Rays
-
-Array = jax.Array
+from apnpql_jax.types import Array
 
 
 class Texture(NamedTuple):
-  """Waves through n things, of which the last is the background."""
+  """Waves through n - 1 geoms and, last, through the background."""
 
-  waves: Array  # f32[n, 3, 4]: vectors in the geom's own frame, 1/m; phases, turns
-  grain: Array  # f32[n]: share of the brightness that noise takes at most
+  waves: Array  # f32[n, 3, 4]: wave vectors in the geom's frame, 1/m; phases, turns
+  grain: Array  # f32[n]: largest share of the brightness that noise removes
 
 
 def odd_square(x: Array, y: Array) -> Array:
-  """f32[P]: one on the odd squares of a checker of edge one, zero on the even ones."""
+  """Returns f32[P]: one on the odd squares of a checker of edge one, zero on others."""
   return _odd(jnp.floor(x) + jnp.floor(y))
 
 
@@ -34,7 +33,7 @@ def _odd(x: Array) -> Array:
   return x - 2.0 * jnp.floor(x * 0.5)
 
 
-def textured(
+def apply_texture(
   frames: Frames,
   texture: Texture,
   cam_xmat: Array,
@@ -42,17 +41,18 @@ def textured(
   t: Array,
   paint: Array,
 ) -> Array:
-  """f32[P]: paint with the texture of what has been hit.
+  """Returns the paint f32[P] with the texture at the visible points.
 
-  Done once per pixel for what is seen there, not at each intersection: there it took
-  sixteen times as long, because XLA did not keep the fold over the geoms in one piece.
+  Textures are evaluated once per pixel, for the visible point. Evaluated at each
+  intersection they took sixteen times as long: XLA did not compile the fold over the
+  geoms into one loop.
 
   Args:
     frames: of the geoms, [n - 1, ...].
-    texture: of the n things.
+    texture: of geoms and background, [n, ...].
     cam_xmat: f32[3, 3], world rotation of the camera.
     rays: rays of the image.
-    t: f32[P], depth of what has been hit on each ray, or ``MISS``.
+    t: f32[P], depth of the visible point on each ray, or ``MISS``.
     paint: f32[P], see ``raycast``.
   """
   waves, grain = texture
@@ -60,23 +60,23 @@ def textured(
   axes = jnp.concatenate([axes, cam_xmat[None]])  # Its rows are the world's axes.
   offset = jnp.pad(frames.offset, ((0, 1), (0, 0)))
   t = jnp.where(t < MISS, t, jnp.sqrt(rays.inv_norm2))
-  # In the camera's frame: the phase at a depth is then one inner product with the ray.
+  # Wave vectors in the camera's frame: a phase is then an inner product with the ray.
   ahead = (waves[:, :, :3, None] * axes[:, None]).sum(axis=2)
   start = waves[:, :, 3] - (waves[:, :, :3] * offset[:, None]).sum(axis=2)
   index = jnp.floor(paint)
   entry = index.astype(jnp.int32)
 
-  def of_hit(values: Array) -> Array:
+  def at_hit(values: Array) -> Array:
     return jnp.take(values, entry, mode="clip")
 
   halves, height = jnp.zeros(t.shape, jnp.float32), jnp.zeros(t.shape, jnp.float32)
   for i in range(waves.shape[1]):
-    vector = [of_hit(ahead[:, i, j]) for j in range(3)]
+    vector = [at_hit(ahead[:, i, j]) for j in range(3)]
     turns = t * (vector[0] * rays.u + vector[1] * rays.v - vector[2])
-    turns = turns + of_hit(start[:, i])
+    turns = turns + at_hit(start[:, i])
     halves = halves + jnp.floor(2.0 * turns)
-    # A sine in shape, but without its costly reduction of large angles.
+    # Shaped like a sine, without the costly range reduction of large angles.
     slope = jnp.abs(2.0 * (turns - jnp.floor(turns)) - 1.0)
     height = height + slope * slope * (3.0 - 2.0 * slope)
-  dim = 1.0 - of_hit(grain) * height / waves.shape[1]
+  dim = 1.0 - at_hit(grain) * height / waves.shape[1]
   return index + len(waves) * _odd(halves) + dim * (paint - index)

@@ -12,7 +12,7 @@ from apnpql_jax.types import ARM_DOF, Array
 
 
 class ArmChain(struct.PyTreeNode):
-  """The serial chain from the world to the tool site, lengths in m."""
+  """The serial chain from the world to the tool site; lengths in m."""
 
   base_pos: Array  # f32[*b, 3]: parent of the first link in the world
   base_mat: Array  # f32[*b, 3, 3]
@@ -28,18 +28,22 @@ def make_chain(scene: Scene) -> ArmChain:
   model = scene.model
   data = mujoco.MjData(model)
   mujoco.mj_kinematics(model, data)
-  bodies = [model.jnt_bodyid[model.dof_jntid[dof]] for dof in scene.arm_dof]
+  joints = model.dof_jntid[scene.arm_dof]
+  bodies = model.jnt_bodyid[joints]
   base, last = model.body_parentid[bodies[0]], bodies[-1]
-  # The tool site may hang on rigidly attached bodies: take it relative to the last
-  # link at the reference pose.
+  link_mat = np.zeros((ARM_DOF, 9))
+  for mat, body in zip(link_mat, bodies, strict=True):
+    mujoco.mju_quat2Mat(mat, model.body_quat[body])
+  # The tool site may belong to a body fixed to the last link: take its pose relative
+  # to that link, at the reference pose.
   last_mat = data.xmat[last].reshape(3, 3)
   tool_mat = data.site_xmat[scene.tool_site].reshape(3, 3)
   arrays = {
     "base_pos": data.xpos[base],
     "base_mat": data.xmat[base].reshape(3, 3),
     "link_pos": model.body_pos[bodies],
-    "link_mat": np.stack([_quat_to_mat(model.body_quat[b]) for b in bodies]),
-    "axis": model.jnt_axis[model.dof_jntid[scene.arm_dof]],
+    "link_mat": link_mat.reshape(-1, 3, 3),
+    "axis": model.jnt_axis[joints],
     "tool_pos": last_mat.T @ (data.site_xpos[scene.tool_site] - data.xpos[last]),
     "tool_mat": last_mat.T @ tool_mat,
   }
@@ -47,12 +51,12 @@ def make_chain(scene: Scene) -> ArmChain:
 
 
 def with_base(chain: ArmChain, scene: Scene, fields: dict[str, Array]) -> ArmChain:
-  """The arm of worlds whose robots stand differently; for angles f32[worlds, n, 6].
+  """Returns the chain with the base pose of each world, for q f32[worlds, n, 6].
 
   Args:
-    chain: the arm as the scene has it.
-    scene: names its base.
-    fields: of ``PhysicsState``, [worlds, ...]; without poses of bodies the arm stays.
+    chain: the arm of the scene.
+    scene: the scene, which names the base.
+    fields: those of ``PhysicsState``, [worlds, ...]; a pose they lack is kept.
   """
   base = scene.id("body", "base")
   if "body_pos" in fields:
@@ -63,7 +67,7 @@ def with_base(chain: ArmChain, scene: Scene, fields: dict[str, Array]) -> ArmCha
 
 
 def forward(chain: ArmChain, q: Array) -> tuple[Array, Array, Array]:
-  """Tool pose and geometric Jacobian in the world frame.
+  """Computes tool pose and geometric Jacobian in the world frame.
 
   Args:
     chain: the arm.
@@ -78,6 +82,7 @@ def forward(chain: ArmChain, q: Array) -> tuple[Array, Array, Array]:
   mat = jnp.broadcast_to(chain.base_mat, (*batch, 3, 3))
   origins, axes = [], []
   for i in range(ARM_DOF):
+    # Joint frame in the world, then the rotation by the joint angle.
     pos = pos + mat @ chain.link_pos[i]
     mat = mat @ chain.link_mat[i]
     origins.append(pos)
@@ -85,14 +90,16 @@ def forward(chain: ArmChain, q: Array) -> tuple[Array, Array, Array]:
     mat = mat @ _axis_rotation(chain.axis[i], q[..., i])
   pos = pos + mat @ chain.tool_pos
   mat = mat @ chain.tool_mat
+  # Each joint moves the tool by axis x lever.
   axis, origin = jnp.stack(axes, -1), jnp.stack(origins, -1)
   linear = jnp.cross(axis, pos[..., None] - origin, axis=-2)
   return pos, mat, jnp.concatenate([linear, axis], axis=-2)
 
 
 def rotation_error(current: Array, target: Array) -> Array:
-  """Rotation vector f32[*b, 3] (rad, world frame) that turns current into target."""
+  """Returns the rotation vector f32[*b, 3] (rad, world) from current to target."""
   delta = target @ jnp.swapaxes(current, -1, -2)
+  # The skew part of a rotation is sin(angle) * axis, its trace 1 + 2 cos(angle).
   skew = 0.5 * jnp.stack(
     [
       delta[..., 2, 1] - delta[..., 1, 2],
@@ -107,25 +114,20 @@ def rotation_error(current: Array, target: Array) -> Array:
 
 
 def _axis_rotation(axis: Array, angle: Array) -> Array:
-  """Rodrigues' formula, f32[*b, 3, 3]."""
-  x, y, z = axis
-  zero = jnp.zeros_like(x)
-  skew = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+  """Returns f32[*b, 3, 3] by Rodrigues' formula."""
+  skew = _skew(axis)
   sine, cosine = jnp.sin(angle)[..., None, None], jnp.cos(angle)[..., None, None]
   return jnp.eye(3) + sine * skew + (1 - cosine) * (skew @ skew)
 
 
 def _rotation(quat: Array) -> Array:
-  """Rotations f32[*b, 3, 3] of unit quaternions f32[*b, 4] (wxyz)."""
-  w, v = quat[..., :1, None], quat[..., 1:]
-  zero = jnp.zeros_like(v[..., 0])
-  x, y, z = jnp.moveaxis(v, -1, 0)
-  skew = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1)
-  skew = skew.reshape(*v.shape, 3)
+  """Returns the rotations f32[*b, 3, 3] of unit quaternions f32[*b, 4] (wxyz)."""
+  w, skew = quat[..., :1, None], _skew(quat[..., 1:])
   return jnp.eye(3) + 2 * (w * skew + skew @ skew)
 
 
-def _quat_to_mat(quat: np.ndarray) -> np.ndarray:
-  mat = np.zeros(9)
-  mujoco.mju_quat2Mat(mat, quat)
-  return mat.reshape(3, 3)
+def _skew(v: Array) -> Array:
+  """Returns the matrices f32[*b, 3, 3] of the cross products with f32[*b, 3]."""
+  x, y, z = jnp.moveaxis(v, -1, 0)
+  zero = jnp.zeros_like(x)
+  return jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*v.shape, 3)

@@ -1,15 +1,16 @@
 """NumPy functions called from compiled code that XLA can cache.
 
-``jax.pure_callback`` writes the address of a Python object into the program, so that
-each process compiles it anew, for minutes. A call through XLA's foreign function
-interface is known by name instead, and the program that makes it is read back from
-JAX's persistent cache. The structures are those of XLA's ``ffi/api/c_api.h``.
+``jax.pure_callback`` writes the address of a Python object into the program, so every
+process would compile it again, for minutes. A call through XLA's foreign function
+interface refers to a name instead, so JAX's persistent cache can hold the program.
+The structures are those of XLA's ``ffi/api/c_api.h``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import ctypes
+from ctypes import CFUNCTYPE, POINTER, c_char_p, c_int, c_int64, c_size_t, c_void_p
 import math
 import traceback
 from typing import Any
@@ -18,23 +19,23 @@ import jax
 import numpy as np
 
 HostFunction = Callable[..., Sequence[np.ndarray]]
-"""(f32 arrays, read only) -> f32 arrays; touches NumPy only, as JAX could deadlock."""
+"""(read-only f32 arrays) -> f32 arrays; uses NumPy only, because JAX could deadlock."""
 
 _MAJOR, _MINOR = 0, 1
-"""Version of the interface that what is used here has been in since."""
+"""First version of the interface that has everything used here."""
 
 _F32, _EXECUTE, _METADATA, _INTERNAL = 11, 3, 1, 13
 
 _registered: dict[str, tuple[HostFunction, Any]] = {}
-"""Name -> function and what XLA has the address of; both must outlive every program."""
+"""Name -> function and the callback given to XLA; both must outlive every program."""
 
 
 def register(name: str, function: HostFunction) -> None:
-  """Makes ``call`` find ``function``; a name keeps its first function.
+  """Makes a function available to ``call``; a name keeps its first function.
 
   Args:
-    name: must tell functions apart in every process: programs that were compiled by
-      another one know the function by it, and by nothing else.
+    name: identifies the function in every process: a program from the cache finds the
+      function by its name alone.
     function: returns arrays of the shapes that ``call`` was given.
   """
   if name in _registered:
@@ -51,130 +52,118 @@ def register(name: str, function: HostFunction) -> None:
       return None
     try:
       results = function(*map(_array, frame.arguments.buffers()))
-      for to, value in zip(frame.results.buffers(), results, strict=True):
-        _array(to)[...] = value
+      for buffer, value in zip(frame.results.buffers(), results, strict=True):
+        _array(buffer)[...] = value
       return None
-    except BaseException:  # Nothing may be raised into XLA.
+    except BaseException:  # No exception may reach XLA.
       message = traceback.format_exc().encode()
       error = _ErrorArgs(ctypes.sizeof(_ErrorArgs), None, message, _INTERNAL)
       return frame.api.contents.create_error(ctypes.byref(error))
 
   _registered[name] = function, _Handler(handler)
-  address = ctypes.cast(_registered[name][1], ctypes.c_void_p)
+  address = ctypes.cast(_registered[name][1], c_void_p)
   jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(address), platform="cpu")
 
 
 def call(name: str, shapes: Sequence[Any], *arrays: Any) -> Sequence[Any]:
-  """Inside jit: what the function of this name makes of f32 ``arrays``.
+  """Calls a registered function inside jit.
 
   Args:
     name: as given to ``register``.
-    shapes: ShapeDtypeStructs of what it returns.
-    arrays: its arguments.
+    shapes: ShapeDtypeStructs of the results.
+    arrays: f32 arguments of the function.
   """
   if jax.default_backend() == "cpu":
     return jax.ffi.ffi_call(name, shapes)(*arrays)
-  # The arrays of a program on another device have to come over first.
+  # On other devices the arrays have to be copied to the host first.
   function, _ = _registered[name]
   host = lambda *arrays: tuple(function(*map(np.asarray, arrays)))  # noqa: E731
   return jax.pure_callback(host, tuple(shapes), *arrays)
 
 
 def _array(buffer: Any) -> np.ndarray:
-  """The memory of a buffer as an array."""
+  """Returns a view of a buffer's memory."""
   if buffer.dtype != _F32:
-    raise TypeError(f"a buffer of XLA type {buffer.dtype} is none of f32")
+    raise TypeError(f"expected an f32 buffer, got one of XLA type {buffer.dtype}")
   shape = tuple(buffer.dims[: buffer.rank])
   size = math.prod(shape)
-  if not size:  # Its address may be null.
+  if not size:  # The address may be null.
     return np.empty(shape, np.float32)
   return np.asarray((ctypes.c_float * size).from_address(buffer.data)).reshape(shape)
 
 
-class _Version(ctypes.Structure):
-  _fields_ = (
-    ("size", ctypes.c_size_t),
-    ("extension", ctypes.c_void_p),
-    ("major", ctypes.c_int),
-    ("minor", ctypes.c_int),
-  )
+class _Struct(ctypes.Structure):
+  """The fields that most structures begin with."""
+
+  _fields_ = (("size", c_size_t), ("extension", c_void_p))
+
+
+class _Version(_Struct):
+  _fields_ = (("major", c_int), ("minor", c_int))
 
 
 class _Metadata(ctypes.Structure):
-  _fields_ = (("size", ctypes.c_size_t), ("version", _Version))
+  _fields_ = (("size", c_size_t), ("version", _Version))
 
 
 class _Extension(ctypes.Structure):
   _fields_ = (
-    ("size", ctypes.c_size_t),
-    ("kind", ctypes.c_int),
-    ("next", ctypes.c_void_p),
-    ("metadata", ctypes.POINTER(_Metadata)),
+    ("size", c_size_t),
+    ("kind", c_int),
+    ("next", c_void_p),
+    ("metadata", POINTER(_Metadata)),
   )
 
 
-class _Buffer(ctypes.Structure):
+class _Buffer(_Struct):
   _fields_ = (
-    ("size", ctypes.c_size_t),
-    ("extension", ctypes.c_void_p),
-    ("dtype", ctypes.c_int),
-    ("data", ctypes.c_void_p),
-    ("rank", ctypes.c_int64),
-    ("dims", ctypes.POINTER(ctypes.c_int64)),
+    ("dtype", c_int),
+    ("data", c_void_p),
+    ("rank", c_int64),
+    ("dims", POINTER(c_int64)),
   )
 
 
-class _Buffers(ctypes.Structure):
-  """Arguments or results."""
+class _Buffers(_Struct):
+  """Arguments or results of a call."""
 
   _fields_ = (
-    ("size", ctypes.c_size_t),
-    ("extension", ctypes.c_void_p),
-    ("count", ctypes.c_int64),
-    ("kinds", ctypes.c_void_p),
-    ("pointers", ctypes.POINTER(ctypes.POINTER(_Buffer))),
+    ("count", c_int64),
+    ("kinds", c_void_p),
+    ("pointers", POINTER(POINTER(_Buffer))),
   )
 
   def buffers(self) -> list[_Buffer]:
+    """Returns the buffers in order."""
     return [self.pointers[i].contents for i in range(self.count)]
 
 
-class _ErrorArgs(ctypes.Structure):
-  _fields_ = (
-    ("size", ctypes.c_size_t),
-    ("extension", ctypes.c_void_p),
-    ("message", ctypes.c_char_p),
-    ("code", ctypes.c_int),
-  )
+class _ErrorArgs(_Struct):
+  _fields_ = (("message", c_char_p), ("code", c_int))
 
 
-class _Api(ctypes.Structure):
-  """Its beginning."""
+class _Api(_Struct):
+  """The first fields of the structure."""
 
   _fields_ = (
-    ("size", ctypes.c_size_t),
-    ("extension", ctypes.c_void_p),
     ("version", _Version),
-    ("internal", ctypes.c_void_p),
-    (
-      "create_error",
-      ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_ErrorArgs)),
-    ),
+    ("internal", c_void_p),
+    ("create_error", CFUNCTYPE(c_void_p, POINTER(_ErrorArgs))),
   )
 
 
 class _CallFrame(ctypes.Structure):
-  """Its beginning."""
+  """The first fields of the structure."""
 
   _fields_ = (
-    ("size", ctypes.c_size_t),
-    ("extension", ctypes.POINTER(_Extension)),
-    ("api", ctypes.POINTER(_Api)),
-    ("context", ctypes.c_void_p),
-    ("stage", ctypes.c_int),
+    ("size", c_size_t),
+    ("extension", POINTER(_Extension)),
+    ("api", POINTER(_Api)),
+    ("context", c_void_p),
+    ("stage", c_int),
     ("arguments", _Buffers),
     ("results", _Buffers),
   )
 
 
-_Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_CallFrame))
+_Handler = CFUNCTYPE(c_void_p, POINTER(_CallFrame))

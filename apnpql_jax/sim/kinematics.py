@@ -15,7 +15,7 @@ from apnpql_jax.types import Array
 
 
 class Kinematics(struct.PyTreeNode):
-  """World poses of what can be seen or measured, by MuJoCo id, m."""
+  """World poses of geoms, sites and cameras by MuJoCo id; positions in m."""
 
   geom_xpos: Array  # f32[*b, ngeom, 3]
   geom_xmat: Array  # f32[*b, ngeom, 3, 3]
@@ -23,19 +23,21 @@ class Kinematics(struct.PyTreeNode):
   site_xmat: Array  # f32[*b, nsite, 3, 3]
   cam_xpos: Array  # f32[*b, ncam, 3]
   cam_xmat: Array  # f32[*b, ncam, 3, 3]
-  fields: dict[str, Array]  # of ``PhysicsState``: some change what is seen
+  fields: dict[str, Array]  # of ``PhysicsState``: some change the image
 
 
 def make_kinematics(scene: Scene) -> Callable[[PhysicsState], Kinematics]:
-  """Returns ``f(state) -> Kinematics`` over [worlds, ...], one path for all engines."""
+  """Returns ``f(state) -> Kinematics`` over [worlds, ...]."""
   patch_mjx()
-  device = jax.local_devices()[0]  # MJX would take the first one of all processes.
+  device = jax.local_devices()[0]  # MJX's default is the first of all processes.
   model = mjx.put_model(scene.model, device, impl="jax")
   template = mjx.make_data(scene.model, device, impl="jax")
 
-  def single(qpos, mocap_pos, mocap_quat, fields) -> Kinematics:
-    world = model.replace(**model_fields(fields))
-    data = template.replace(qpos=qpos, mocap_pos=mocap_pos, mocap_quat=mocap_quat)
+  def kinematics(state: PhysicsState) -> Kinematics:
+    world = model.replace(**model_fields(state.fields))
+    data = template.replace(
+      qpos=state.qpos, mocap_pos=state.mocap_pos, mocap_quat=state.mocap_quat
+    )
     data = mjx.camlight(world, mjx.kinematics(world, data))
     return Kinematics(
       geom_xpos=data.geom_xpos,
@@ -44,10 +46,7 @@ def make_kinematics(scene: Scene) -> Callable[[PhysicsState], Kinematics]:
       site_xmat=data.site_xmat,
       cam_xpos=data.cam_xpos,
       cam_xmat=data.cam_xmat,
-      fields=fields,
+      fields=state.fields,
     )
 
-  def kinematics(state: PhysicsState) -> Kinematics:
-    return jax.vmap(single)(state.qpos, state.mocap_pos, state.mocap_quat, state.fields)
-
-  return kinematics
+  return jax.vmap(kinematics)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-import mujoco
 from mujoco import mjx
+import numpy as np
 
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.mjx_patches import patch_mjx
 from apnpql_jax.sim.physics import PhysicsState
-from apnpql_jax.sim.scene import Scene
+from apnpql_jax.sim.scene import Scene, free_joints
 from apnpql_jax.types import Array
 
 
@@ -20,17 +20,12 @@ class MjxPhysics:
   name = "mjx"
 
   def __init__(self, scene: Scene, *, substeps: int):
-    """
-    Args:
-      scene: the scene all worlds share.
-      substeps: physics steps per control period.
-    """
+    """Prepares the model, for ``substeps`` physics steps per control period."""
     patch_mjx()
     self.scene = scene
     self._substeps = substeps
-    joints = scene.model.jnt_type[scene.model.dof_jntid]
-    self._free = joints == mujoco.mjtJoint.mjJNT_FREE
-    device = jax.local_devices()[0]  # MJX would take the first one of all processes.
+    self._free = np.isin(scene.model.dof_jntid, free_joints(scene.model))
+    device = jax.local_devices()[0]  # MJX's default is the first of all processes.
     line_search = int(scene.model.numeric("mjx_ls_iterations").data[0])
     self._model = mjx.put_model(scene.model, device, impl="jax").tree_replace(
       {"opt.ls_iterations": line_search}
@@ -45,14 +40,8 @@ class MjxPhysics:
   def _step_world(self, state, velocity, close):
     model = self._model.replace(**physics.model_fields(state.fields))
     speed = state.fields.get("gripper_speed", physics.GRIPPER_SPEED)
-    data = self._template.replace(
-      qpos=state.qpos,
-      qvel=state.qvel,
-      qacc_warmstart=state.qacc_warmstart,
-      mocap_pos=state.mocap_pos,
-      mocap_quat=state.mocap_quat,
-      time=state.time,
-    )
+    loaded = {name: getattr(state, name) for name in physics.STATE_FIELDS}
+    data = self._template.replace(**loaded)
 
     def substep(carry, index):
       now, grip = velocity, close
@@ -75,8 +64,8 @@ class MjxPhysics:
     )
 
   def _substep(self, model, data, velocity, close, speed):
-    # mjx.step with the control between its velocity and actuation stages, so that
-    # mass matrix and bias are those of the present state and computed only once.
+    # mjx.step with the control between its velocity and actuation stages: mass matrix
+    # and bias are those of the present state and computed only once.
     arm = self.scene.arm_dof
     data = mjx.fwd_velocity(model, mjx.fwd_position(model, data))
     torque = physics.arm_torque(
@@ -96,9 +85,9 @@ class MjxPhysics:
     data = data.replace(ctrl=jnp.append(torque, finger))
     data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
     data = mjx.solve(model, data)
-    # In float32 the solver can stop while forces and accelerations do not quite belong
-    # together. The integrator takes the forces, and what is left over throws a light
-    # object away: so those of free bodies are made to be those of the accelerations.
+    # In float32 the solver can stop before forces and accelerations match. The
+    # integrator uses the forces, and the residual would throw light objects away:
+    # free bodies get the forces that belong to the accelerations.
     force = mjx.mul_m(model, data, data.qacc) - data.qfrc_smooth
     force = jnp.where(self._free, force, data.qfrc_constraint)
     return mjx.implicit(model, data.replace(qfrc_constraint=force))

@@ -1,7 +1,7 @@
-"""Two places where stock MJX is slower than it need be, mended without copying it.
+"""Replacements for two functions that are slow in stock MJX.
 
-Both functions are private to mujoco-mjx, hence the narrow patches. A barrier changes no
-value; ``tests/test_mjx_patches.py`` compares the Newton direction with stock MJX.
+Both are private to mujoco-mjx, so the patches are narrow. A barrier changes no value;
+``tests/sim/test_mjx_patches.py`` compares the Newton direction with stock MJX.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ import numpy as np
 
 
 def patch_mjx() -> None:
-  """Applies both patches; repeating it changes nothing.
+  """Applies both patches; safe to call again.
 
   Kinematic chains: on the CPU, XLA's fusion duplicates the work of a parent body into
-  each child: on a chain of eight bodies stock MJX is three orders of magnitude slower
-  under vmap. An optimisation barrier behind every body ends it.
+  each child. On a chain of eight bodies this makes stock MJX three orders of magnitude
+  slower under vmap. An optimization barrier after every body prevents it.
 
   Elliptic cones: to add up their Hessians, the solver multiplies the Jacobian by a
-  dense matrix of rows x rows, of which only a block of at most 6 x 6 per contact
-  differs from zero. Summing over the blocks makes cost and memory linear in the rows.
+  dense matrix of rows x rows, which is zero outside one block of at most 6 x 6 per
+  contact. Summing over the blocks makes cost and memory linear in the rows.
   """
   if jax.default_backend() == "cpu":
     _scan.body_tree = _guarded_body_tree
@@ -39,7 +39,7 @@ def _guarded_body_tree(m, f, in_types, out_types, *args, reverse=False):
 
 
 def _update_gradient(m, d, ctx):
-  """Gradient and Newton direction; stock for all but Newton with elliptic cones."""
+  """Computes gradient and Newton direction; stock unless Newton with elliptic cones."""
   elliptic = m.opt.cone == mjx.ConeType.ELLIPTIC
   if not elliptic or m.opt.solver != mjx.SolverType.NEWTON:
     return _stock_update_gradient(m, d, ctx)
@@ -49,12 +49,12 @@ def _update_gradient(m, d, ctx):
   dims = contact.dim[contact.dim > 1]
   addresses = contact.efc_address[contact.dim > 1]
   for dim in np.unique(dims):
-    # Contacts of one dimension lie together: a slice, not a gather.
+    # Contacts of one dimension are contiguous: a slice, not a gather.
     chosen = np.flatnonzero(dims == dim)
     first, last = addresses[chosen[0]], addresses[chosen[-1]] + dim
     cones = ctx.h[chosen[0] : chosen[-1] + 1, :dim, :dim]
     rows = jacobian[first:last].reshape(len(chosen), dim, -1)
-    # Not a product of matrices: XLA:CPU calls one for each of these small blocks.
+    # Not a matrix product: XLA:CPU would call one for each of these small blocks.
     added = jnp.sum(cones[..., None] * rows[:, None], axis=2)
     weighted = weighted.at[first:last].add(added.reshape(last - first, -1))
   hessian = mjx.full_m(m, d) + jacobian.T @ weighted

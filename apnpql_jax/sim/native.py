@@ -1,7 +1,7 @@
-"""C MuJoCo engine: a batch of worlds on threads, reached from inside jit.
+"""C MuJoCo engine: a batch of worlds on threads, called from inside jit.
 
-On a bare CPU it is ten to a hundred times faster than MJX on contact-rich
-scenes. Compiled code calls it by name, see ``host_call``.
+On a machine without an accelerator it is ten to a hundred times faster than MJX on
+contact-rich scenes. Compiled code calls it by name, see ``host_call``.
 """
 
 from __future__ import annotations
@@ -17,21 +17,13 @@ from mujoco import batch as mujoco_batch
 import numpy as np
 
 from apnpql_jax.sim import host_call, physics
-from apnpql_jax.sim.physics import PhysicsState
+from apnpql_jax.sim.physics import STATE_FIELDS, PhysicsState
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
 
-_STATE_FIELDS = (
-  "qpos",
-  "qvel",
-  "qacc_warmstart",
-  "mocap_pos",
-  "mocap_quat",
-  "time",
-)
 _CONTROL = ("gripper_speed", "control_delay", "command")
-_UNFELT = ("cam_", "light_", "geom_rgba")
-"""Beginnings of names of model fields that physics need not be told of."""
+_VISUAL = ("cam_", "light_", "geom_rgba")
+"""Prefixes of model fields that do not affect physics."""
 
 
 class NativePhysics:
@@ -44,11 +36,7 @@ class NativePhysics:
   name = "native"
 
   def __init__(self, scene: Scene, *, substeps: int):
-    """
-    Args:
-      scene: the scene all worlds share.
-      substeps: physics steps per control period.
-    """
+    """Prepares the engine, for ``substeps`` physics steps per control period."""
     self.scene = scene
     self._substeps = substeps
     self._torque_limit = scene.model.actuator_ctrlrange[:6, 1].copy()
@@ -57,32 +45,36 @@ class NativePhysics:
 
   def step(self, state: PhysicsState, velocity: Array, close: Array) -> PhysicsState:
     """See ``physics.Physics.step``."""
-    arrays = {name: getattr(state, name) for name in _STATE_FIELDS}
-    arrays |= {k: v for k, v in sorted(state.fields.items()) if _is_felt(k)}
+    arrays = {name: getattr(state, name) for name in STATE_FIELDS}
+    arrays |= {k: v for k, v in sorted(state.fields.items()) if _affects_physics(k)}
     after = {}
     if state.command is not None:
       arrays["command"] = state.command
       after["command"] = jnp.concatenate([velocity, close[:, None]], axis=-1)
-    shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arrays.values()]
-    call = self._register(tuple(arrays))
-    moved = host_call.call(
-      call, shapes[: len(_STATE_FIELDS)], *arrays.values(), velocity, close
-    )
-    return state.replace(**dict(zip(_STATE_FIELDS, moved, strict=True)), **after)
-
-  def _register(self, names: tuple[str, ...]) -> str:
-    """The name of the call that is given worlds as arrays of these names."""
+    names = tuple(arrays)
     digest = hashlib.sha256(" ".join(names).encode()).hexdigest()[:16]
-    call = f"apnpql_native_{self.scene.fingerprint}_{self._substeps}_{digest}"
-    host_call.register(call, functools.partial(self._step_host, names))
-    return call
+    target = f"apnpql_native_{self.scene.fingerprint}_{self._substeps}_{digest}"
+    host_call.register(target, functools.partial(self._step_host, names))
+    shapes = [
+      jax.ShapeDtypeStruct(arrays[k].shape, arrays[k].dtype) for k in STATE_FIELDS
+    ]
+    moved = host_call.call(target, shapes, *arrays.values(), velocity, close)
+    return state.replace(**dict(zip(STATE_FIELDS, moved, strict=True)), **after)
 
   @functools.lru_cache(maxsize=4)  # noqa: B019 - lives as long as the engine
   def _batch(self, worlds: int) -> mujoco_batch.Batch:
     return mujoco_batch.Batch(self.scene.model, nsim=worlds, persistent=True)
 
   def _step_host(self, names: tuple[str, ...], *arrays: np.ndarray) -> list[np.ndarray]:
-    """Worlds given by name, then velocities and gripper; returns ``_STATE_FIELDS``."""
+    """Advances the worlds on the host.
+
+    Args:
+      names: what each array is, without the last two.
+      *arrays: [worlds, ...]; the last two are desired velocities and gripper commands.
+
+    Returns:
+      The new ``STATE_FIELDS``, f32[worlds, ...].
+    """
     *loaded, velocity, close = arrays
     command = np.concatenate([velocity, close[:, None]], axis=-1)
     with self._lock:
@@ -91,10 +83,10 @@ class NativePhysics:
         if name in _CONTROL:
           control[name] = value
           continue
-        held = getattr(batch, name) if name in _STATE_FIELDS else batch.expand(name)
-        held[...] = value
+        target = getattr(batch, name) if name in STATE_FIELDS else batch.expand(name)
+        target[...] = value
       self._advance(batch, command, control)
-      return [np.array(getattr(batch, name), np.float32) for name in _STATE_FIELDS]
+      return [np.array(getattr(batch, name), np.float32) for name in STATE_FIELDS]
 
   def _advance(self, batch, command, control) -> None:
     scene, arm = self.scene, self.scene.arm_dof
@@ -125,14 +117,14 @@ class NativePhysics:
       batch.step(stage=stage)
 
 
-def _is_felt(field: str) -> bool:
-  """Whether physics need be told of a field of ``PhysicsState``."""
-  own = field in physics.OWN_FIELDS and field not in _CONTROL
-  return not own and not field.startswith(_UNFELT)
+def _affects_physics(field: str) -> bool:
+  """Returns whether the engine needs a field of ``PhysicsState.fields``."""
+  is_model = field not in physics.OWN_FIELDS and not field.startswith(_VISUAL)
+  return is_model or field in _CONTROL
 
 
 def _mass_index(model: mujoco.MjModel, dofs: np.ndarray) -> np.ndarray:
-  """int[n, n], where the dense block of ``dofs`` lies in the sparse ``data.M``."""
+  """Returns int[n, n]: where the sparse ``data.M`` holds the block of ``dofs``."""
   index = np.zeros((len(dofs), len(dofs)), np.int64)
   for row, i in enumerate(dofs):
     start, count = model.M_rowadr[i], model.M_rownnz[i]

@@ -10,11 +10,9 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from flax import struct
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax.config import BACKENDS, check_name
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
 
@@ -28,27 +26,29 @@ VELOCITY_GAIN = 25.0
 """1/s; brings a joint to the desired velocity well within one 0.15 s period."""
 
 GRIPPER_SPEED = 0.075
-"""m/s of pad gap: the closing speed in the maker's manual."""
+"""m/s of pad gap: the closing speed in the manufacturer's manual."""
 
 GRIPPER_GAIN = 10.0
-"""N m s/rad, half of what one 5 ms step of the coupled fingers can bear."""
+"""N m s/rad, half of what is stable for the coupled fingers at 5 ms steps."""
 
 GRIPPER_TORQUE = 3.5
-"""N m, as in the maker's model: 30-60 N per pad."""
+"""N m, as in the manufacturer's model: 30-60 N per pad."""
 
 FINGER_LENGTH = 0.057
 """m; with FINGER_ANGLE the closed form gap(q) = 2 (4.1 mm + L cos(q + 30 deg))."""
 
 FINGER_ANGLE = np.pi / 6
 
-
 START_TIME = 1.0
-"""s; clocks begin above zero, where C MuJoCo puts that of a world it has reset, so that
-such a reset shows even in the first period."""
+"""s; clocks start above zero. C MuJoCo sets the clock of a world that it resets to
+zero, so a reset shows even in the first period."""
+
+STATE_FIELDS = ("qpos", "qvel", "qacc_warmstart", "mocap_pos", "mocap_quat", "time")
+"""Fields of ``PhysicsState`` that MuJoCo's data has too."""
 
 
 class PhysicsState(struct.PyTreeNode):
-  """Everything an engine needs to go on."""
+  """Everything an engine needs to continue a simulation."""
 
   qpos: Array  # f32[*b, nq]
   qvel: Array  # f32[*b, nv]
@@ -56,8 +56,8 @@ class PhysicsState(struct.PyTreeNode):
   mocap_pos: Array  # f32[*b, nmocap, 3]
   mocap_quat: Array  # f32[*b, nmocap, 4]
   time: Array  # f32[*b], s since the reset, plus START_TIME
-  fields: dict[str, Array]  # what differs between worlds, see model_fields; [*b, ...]
-  command: Array | None = None  # f32[*b, 7]: the last one, where commands are delayed
+  fields: dict[str, Array]  # differ between worlds, see model_fields; [*b, ...]
+  command: Array | None = None  # f32[*b, 7]: the last one, if commands are delayed
 
 
 class Physics(Protocol):
@@ -77,42 +77,23 @@ class Physics(Protocol):
     ...
 
 
-def make_physics(name: str, scene: Scene, *, substeps: int) -> Physics:
-  """Engine ``name``; "auto" takes C MuJoCo on a bare CPU and MJX elsewhere.
-
-  Raises:
-    ConfigError: unknown name.
-  """
-  check_name("backend", name, BACKENDS)
-  if name == "auto":
-    name = "native" if jax.default_backend() == "cpu" else "mjx"
-  if name == "native":
-    from apnpql_jax.sim.native import NativePhysics
-
-    return NativePhysics(scene, substeps=substeps)
-  from apnpql_jax.sim.mjx import MjxPhysics
-
-  return MjxPhysics(scene, substeps=substeps)
-
-
 def initial_state(
   scene: Scene, qpos: Array, mocap_pos: Array, mocap_quat: Array, variant: Array
 ) -> PhysicsState:
-  """A state at rest.
+  """Returns a state at rest.
 
   Args:
-    scene: gives the sizes.
+    scene: sets the sizes and the fields of its variants.
     qpos: f32[*b, nq].
     mocap_pos: f32[*b, nmocap, 3].
     mocap_quat: f32[*b, nmocap, 4].
-    variant: i32[*b], which of the scene's variants each world is.
+    variant: i32[*b], variant of the scene in each world.
   """
   batch = qpos.shape[:-1]
-  model = scene.model
   return PhysicsState(
     qpos=qpos,
-    qvel=jnp.zeros((*batch, model.nv)),
-    qacc_warmstart=jnp.zeros((*batch, model.nv)),
+    qvel=jnp.zeros((*batch, scene.model.nv)),
+    qacc_warmstart=jnp.zeros((*batch, scene.model.nv)),
     mocap_pos=mocap_pos,
     mocap_quat=mocap_quat,
     time=jnp.full(batch, START_TIME, jnp.float32),
@@ -121,9 +102,9 @@ def initial_state(
 
 
 OWN_FIELDS = (
-  "gripper_speed",  # f32[]: in place of GRIPPER_SPEED, m/s
+  "gripper_speed",  # f32[]: replaces GRIPPER_SPEED, m/s
   "control_delay",  # f32[]: whole physics steps until a command takes effect
-  "background",  # f32[3]: see ``render.look``, like the rest
+  "background",  # f32[3]: this and the rest: see ``render.appearance.FIELDS``
   "waves",  # f32[ngeom + 1, 3, 4]
   "odd_rgb",  # f32[ngeom + 1, 3]
   "grain",  # f32[ngeom + 1]
@@ -132,12 +113,12 @@ OWN_FIELDS = (
 
 
 def model_fields(fields: dict[str, Array]) -> dict[str, Array]:
-  """Those of ``PhysicsState.fields`` that replace fields of MuJoCo's model."""
+  """Returns those ``PhysicsState.fields`` that replace fields of MuJoCo's model."""
   return {name: value for name, value in fields.items() if name not in OWN_FIELDS}
 
 
 def arm_torque(mass: Any, bias: Any, qvel: Any, desired: Any, limit: Any) -> Any:
-  """Inverse-dynamics torque of the arm; NumPy or JAX arrays.
+  """Computes the inverse-dynamics torque of the arm; NumPy or JAX arrays.
 
   tau = M clip(gain (v* - v), +-a_max) + bias, clipped to the joint's limit.
 
@@ -161,10 +142,10 @@ def arm_torque(mass: Any, bias: Any, qvel: Any, desired: Any, limit: Any) -> Any
 def gripper_torque(
   angle: Any, velocity: Any, close: Any, xp: Any, *, speed: Any = GRIPPER_SPEED
 ) -> Any:
-  """Torque of the driven finger: fixed speed of the pad gap, bounded squeeze.
+  """Computes the torque of the driven finger: constant pad speed, limited squeeze.
 
-  An explicit servo in place of a MuJoCo velocity actuator, whose saturated force
-  C MuJoCo and MJX integrate differently.
+  An explicit servo: C MuJoCo and MJX integrate the saturated force of a MuJoCo
+  velocity actuator differently.
 
   Args:
     angle: [*b] driven finger joint, rad, 0 = open.

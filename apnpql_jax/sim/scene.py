@@ -1,7 +1,7 @@
-"""A scene: one compiled MJCF file with the names that the project relies on.
+"""Scenes: compiled MJCF files with the names that the project relies on.
 
-Every scene includes ``mjcf/robot.xml``, hence has the same arm, gripper, tool
-site and wrist camera. Look-ups fail early and name what exists.
+Every scene includes ``mjcf/robot.xml`` and so has the same arm, gripper, tool site and
+wrist camera. Look-ups fail early; their messages list the names that exist.
 """
 
 from __future__ import annotations
@@ -15,74 +15,52 @@ import mujoco
 from mujoco import mjx
 import numpy as np
 
-from apnpql_jax.config import ConfigError
+from apnpql_jax.errors import ConfigError
 
-ARM_JOINTS = (
-  "shoulder_pan",
-  "shoulder_lift",
-  "elbow",
-  "wrist_1",
-  "wrist_2",
-  "wrist_3",
-)
+ARM_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 GRIPPER_JOINT = "finger_r1"
 TOOL_SITE = "tool"
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-  """A compiled model and the addresses of the robot in it.
+  """A compiled model and the addresses of the robot in it."""
 
-  Attributes:
-    name: stem of the MJCF file.
-    model: the compiled model.
-    fingerprint: hash of the compiled model, for caches keyed by the scene.
-    arm_qpos: int[6], addresses of the arm joints in qpos.
-    arm_dof: int[6], addresses of the arm joints in qvel.
-    gripper_qpos: address of the driven finger joint in qpos.
-    gripper_dof: address of the driven finger joint in qvel.
-    tool_site: site id of the tool point between the closed finger tips.
-    cameras: names of the cameras found.
-    variants: model fields that differ between the variants of the scene, and their
-      values f32[variants, ...]; empty if there is only one.
-  """
-
-  name: str
+  name: str  # stem of the MJCF file
   model: mujoco.MjModel
-  fingerprint: str
-  arm_qpos: np.ndarray
-  arm_dof: np.ndarray
-  gripper_qpos: int
-  gripper_dof: int
-  tool_site: int
-  cameras: tuple[str, ...]
-  variants: dict[str, np.ndarray]
+  fingerprint: str  # hash of the compiled models of all variants
+  arm_qpos: np.ndarray  # int[6]: addresses of the arm joints in qpos
+  arm_dof: np.ndarray  # int[6]: addresses of the arm joints in qvel
+  gripper_qpos: int  # address of the driven finger joint in qpos
+  gripper_dof: int  # address of the driven finger joint in qvel
+  tool_site: int  # id of the site between the closed finger tips
+  cameras: tuple[str, ...]  # names of all cameras
+  variants: dict[str, np.ndarray]  # differing model fields, f32[variants, ...]
 
   def id(self, kind: str, name: str) -> int:
-    """Id of a named object of ``kind`` ("body", "site", "camera", "geom", "key").
+    """Returns the id of a "body", "site", "camera", "geom" or "key" by name.
 
     Raises:
-      ConfigError: the MJCF has no such name; the message lists those it has.
+      ConfigError: no such name; the message lists the valid ones.
     """
     return _named_id(self.model, self.name, kind, name)
 
   def free_joint(self, body: str) -> tuple[int, int]:
-    """(qpos, qvel) addresses of the free joint of ``body``."""
+    """Returns the (qpos, qvel) addresses of the free joint of ``body``."""
     joint = self.model.body_jntadr[self.id("body", body)]
-    is_free = joint >= 0 and (self.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE)
-    if not is_free:
+    if joint not in free_joints(self.model):
       raise ConfigError(f"{self.name}.xml: body '{body}' has no free joint")
     return int(self.model.jnt_qposadr[joint]), int(self.model.jnt_dofadr[joint])
 
   def mocap(self, body: str) -> int:
-    """Index of the mocap body ``body`` in mocap_pos."""
+    """Returns the index of the mocap body ``body`` in mocap_pos."""
     index = int(self.model.body_mocapid[self.id("body", body)])
     if index < 0:
       raise ConfigError(f"{self.name}.xml: body '{body}' is not a mocap body")
     return index
 
   def keyframe(self, name: str) -> np.ndarray:
-    """f64[nq], the qpos of a keyframe."""
+    """Returns the qpos of a keyframe, f64[nq]."""
     return self.model.key_qpos[self.id("key", name)].copy()
 
 
@@ -97,16 +75,17 @@ def load_scene(
   Args:
     path: an MJCF file that includes the robot.
     cameras: camera names that must exist.
-    variants: each makes another scene of the same structure by editing the parsed
-      file, such as one more shape of an object. A world can then be any of them.
+    variants: functions that edit the parsed file, one for each variant of the scene,
+      such as the shape of an object; they must keep its structure. Each world then
+      has one of the variants.
 
   Raises:
     ConfigError: the file does not compile, lacks a joint, site or camera, or
       uses a feature that MJX would silently ignore.
   """
-  models = [_compile(path, edit) for edit in variants] or [_compile(path)]
+  models = [_compile(path, edit) for edit in variants or [lambda _: None]]
   model = models[0]
-  refuse_unsupported(model, path.stem)
+  _check_supported(model, path.stem)
   joints = [_named_id(model, path.stem, "joint", name) for name in ARM_JOINTS]
   finger = _named_id(model, path.stem, "joint", GRIPPER_JOINT)
   for camera in cameras:
@@ -125,26 +104,31 @@ def load_scene(
   )
 
 
-def refuse_unsupported(model: mujoco.MjModel, name: str) -> None:
-  """Raises ConfigError where MJX refuses, or accepts but does not simulate.
+def free_joints(model: mujoco.MjModel) -> np.ndarray:
+  """Returns the ids of the free joints, i64[n]."""
+  return np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+
+
+def _check_supported(model: mujoco.MjModel, name: str) -> None:
+  """Checks for features that MJX rejects, or accepts without simulating them.
 
   Source: the MJX-JAX engine of mujoco-mjx 3.17.0 has no code for these.
+
+  Raises:
+    ConfigError: the model uses such a feature.
   """
-  option = model.opt
-  integrators = (
-    mujoco.mjtIntegrator.mjINT_EULER,
-    mujoco.mjtIntegrator.mjINT_RK4,
-    mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+  option, kinds = model.opt, mujoco.mjtIntegrator
+  integrators = kinds.mjINT_EULER, kinds.mjINT_RK4, kinds.mjINT_IMPLICITFAST
+  pgs, sleep = (
+    mujoco.mjtSolver.mjSOL_PGS,
+    getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0),
   )
-  sleep = getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0)
   found = {
     "option/noslip_iterations": option.noslip_iterations > 0,
     "option/integrator (valid: Euler, RK4, implicitfast)": (
-      option.integrator not in [int(kind) for kind in integrators]
+      option.integrator not in map(int, integrators)
     ),
-    "option/solver PGS (valid: CG, Newton)": (
-      option.solver == mujoco.mjtSolver.mjSOL_PGS
-    ),
+    "option/solver PGS (valid: CG, Newton)": option.solver == pgs,
     "option/flag sleep": bool(option.enableflags & int(sleep)),
     "geom/surfacevel": bool(np.any(getattr(model, "geom_surfacevel", 0))),
     "actuators with activation (not part of PhysicsState)": model.na > 0,
@@ -152,33 +136,30 @@ def refuse_unsupported(model: mujoco.MjModel, name: str) -> None:
   }
   names = [feature for feature, used in found.items() if used]
   if names:
-    raise ConfigError(f"{name}.xml uses what is not simulated: {', '.join(names)}")
+    raise ConfigError(f"{name}.xml uses unsupported features: {', '.join(names)}")
   try:
     mjx.put_model(model, impl="jax")
   except NotImplementedError as error:
-    raise ConfigError(f"{name}.xml uses what MJX cannot simulate: {error}") from error
+    raise ConfigError(f"{name}.xml uses a feature MJX lacks: {error}") from error
 
 
 def _named_id(model: mujoco.MjModel, scene: str, kind: str, name: str) -> int:
-  accessor = getattr(model, "cam" if kind == "camera" else kind)
+  short = {"joint": "jnt", "camera": "cam"}.get(kind, kind)
+  accessor = getattr(model, short)
   try:
     return int(accessor(name).id)
   except KeyError:
-    count = getattr(
-      model, {"body": "nbody", "joint": "njnt", "camera": "ncam"}.get(kind, f"n{kind}")
-    )
-    names = [accessor(i).name for i in range(count)]
+    names = [accessor(i).name for i in range(getattr(model, f"n{short}"))]
     valid = ", ".join(n for n in names if n) or "none"
     raise ConfigError(f"{scene}.xml has no {kind} '{name}' (valid: {valid})") from None
 
 
 def _compile(
-  path: pathlib.Path, edit: Callable[[mujoco.MjSpec], None] | None = None
+  path: pathlib.Path, edit: Callable[[mujoco.MjSpec], None]
 ) -> mujoco.MjModel:
   try:
     spec = mujoco.MjSpec.from_file(str(path))
-    if edit is not None:
-      edit(spec)
+    edit(spec)
     return spec.compile()
   except ValueError as error:
     reason = str(error).splitlines()[0]
@@ -186,9 +167,9 @@ def _compile(
 
 
 def _differences(models: Sequence[mujoco.MjModel]) -> dict[str, np.ndarray]:
-  """The fields in which the models differ, of those that MJX has too.
+  """Returns the model fields that differ, as far as MJX has them, f32[models, ...].
 
-  What C MuJoCo has beyond them serves collision filters that explicit pairs bypass.
+  The other fields of C MuJoCo are for collision filters, which explicit pairs bypass.
   """
   differences = {}
   for field in dataclasses.fields(mjx.Model):

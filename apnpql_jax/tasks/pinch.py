@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax.numpy as jnp
+from jaxtyping import Bool, Float
 
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import FINGER_ANGLE, FINGER_LENGTH, PhysicsState
@@ -10,196 +13,187 @@ from apnpql_jax.sim.scene import Scene
 from apnpql_jax.tasks import geometry
 from apnpql_jax.types import Array
 
+Mask = Bool[Array, " worlds"]
+Angle = Float[Array, " worlds"]
+Point = Float[Array, "worlds 3"]
+
 TOLERANCE = 0.004
 """m; how far the pads' gap may be from an object's width while they hold it."""
 
 CLEARANCE = 0.02
-"""m; an open hand leaves this much, both sides together."""
+"""m; spare room of an open hand, both sides together."""
 
 NEAR = 0.012
-"""m; the hand may close when its pinch point is this close to where it shall grip. What
-stands freely is centred by the closing pads, and a policy that sees a pixel per
-centimetre hardly comes closer."""
+"""m; the hand may close when its pinch point is this close to the grasp. The closing
+pads center what stands freely, and a policy that sees a pixel per centimeter hardly
+comes closer."""
 
 LOST = 0.025
 """m; what is further from the pinch point is not in the hand."""
 
 STRAIGHT = 0.25
-"""rad; the hand may close when it is turned away by less: the pads turn what stands
-freely."""
+"""rad; the hand may close when twisted by less: the pads turn what stands freely."""
 
 ALIGNED, FUNNEL = 0.012, 0.05
 """m; the tool goes in fully within the first, stays out beyond the second."""
 
 LEVER = 0.05
-"""m/rad; how much a twist of the fingers beyond half of what is allowed counts as being
-off."""
+"""m/rad; a twist of the fingers beyond half of what is allowed counts as an offset."""
 
 
+@dataclasses.dataclass
 class Pinch:
   """A grip between the pads on something of known width, by a vertical tool.
 
-  All methods are batched over worlds.
+  Attributes:
+    scene: gives the tool site and the finger.
+    neutral_mat: the tool's rotation at heading zero.
+    width: m, of what is gripped.
+    hover: m, height over the grasp at which the open finger tips clear the object.
+    travel: m, tool height at which closed fingers clear everything.
+    above: m, distance along the tool from the aimed point to the pads' center.
+    near: m, see ``NEAR``.
+    straight: rad, see ``STRAIGHT``.
+    depth: m, from the tool site back to the aimed point.
   """
 
-  def __init__(
-    self,
-    scene: Scene,
-    neutral_mat: Array,
-    *,
-    width: float,
-    above: float,
-    hover: float,
-    travel: float,
-    near: float = NEAR,
-    straight: float = STRAIGHT,
-  ):
-    """
-    Args:
-      scene: gives the tool site and the finger.
-      neutral_mat: f32[3, 3], the tool's rotation at heading zero.
-      width: m, of what is gripped.
-      above: m, distance along the tool from where it is aimed at to the pads' centre.
-      hover: m, height over the grasp at which the open finger tips clear the object.
-      travel: m, tool height at which closed fingers clear everything.
-      near: m, see ``NEAR``.
-      straight: rad, see ``STRAIGHT``.
-    """
-    self._hover, self._travel = hover, travel
-    self._near, self._straight = near, straight
-    self._scene, self._neutral_mat, self._width = scene, neutral_mat, width
-    self.depth = float(pinch_height(width)) - above
-    """m from the tool site back to the point that is aimed at what is gripped."""
+  scene: Scene
+  neutral_mat: Float[Array, "3 3"]
+  _: dataclasses.KW_ONLY
+  width: float
+  hover: float
+  travel: float
+  above: float = 0.0
+  near: float = NEAR
+  straight: float = STRAIGHT
+  depth: float = dataclasses.field(init=False)
 
-  def point(self, kinematics: Kinematics) -> Array:
-    """f32[worlds, 3]: where the gripped point of an object in the hand is, m."""
-    mat = kinematics.site_xmat[:, self._scene.tool_site]
-    tool = kinematics.site_xpos[:, self._scene.tool_site]
+  def __post_init__(self):
+    self.depth = float(pinch_height(self.width)) - self.above
+
+  def point(self, kinematics: Kinematics) -> Point:
+    """Returns where the gripped point of an object in the hand is, m."""
+    mat = kinematics.site_xmat[:, self.scene.tool_site]
+    tool = kinematics.site_xpos[:, self.scene.tool_site]
     return tool - self.depth * mat[:, :, 2]
 
-  def twist(self, kinematics: Kinematics, heading: Array, period: float) -> Array:
-    """f32[worlds]: how far the hand is turned away from a heading, rad."""
-    mat = kinematics.site_xmat[:, self._scene.tool_site] @ self._neutral_mat.T
+  def twist(self, kinematics: Kinematics, heading: Angle, period: float) -> Angle:
+    """Returns how far the hand is turned away from a heading, rad."""
+    mat = kinematics.site_xmat[:, self.scene.tool_site] @ self.neutral_mat.T
     return geometry.fold(jnp.arctan2(mat[:, 1, 0], mat[:, 0, 0]) - heading, period)
 
-  def is_open(self, state: PhysicsState) -> Array:
-    """bool[worlds]: the pads are clear of the object on both sides."""
-    return is_open(self._scene, state, self._width)
+  def is_open(self, state: PhysicsState) -> Mask:
+    """Checks that the pads are clear of the object on both sides."""
+    return is_open(self.scene, state, self.width)
 
-  def holds(self, state: PhysicsState, kinematics: Kinematics, point: Array) -> Array:
-    """bool[worlds]: the pads grip something of this width, at ``point`` (m)."""
-    gripping = is_gripping(self._scene, state, self._width)
+  def holds(self, state: PhysicsState, kinematics: Kinematics, point: Point) -> Mask:
+    """Checks that the pads grip something of this width at ``point`` (m)."""
+    gripping = is_gripping(self.scene, state, self.width)
     return gripping & (geometry.norm(self.point(kinematics) - point) < LOST)
 
   def approach(
-    self, state: PhysicsState, kinematics: Kinematics, aim: Array, twist: Array
-  ) -> Array:
-    """Tool position that leads around ``aim`` without knocking it over.
+    self, state: PhysicsState, kinematics: Kinematics, aim: Point, twist: Angle
+  ) -> Point:
+    """Returns the tool position (m) that leads around an object without a collision.
 
     A low tool rises first; over the object it descends through a funnel, but not with
     fingers that are closed on nothing; around the object it stays.
 
     Args:
-      state: [worlds, ...].
-      kinematics: [worlds, ...].
-      aim: f32[worlds, 3], m.
-      twist: f32[worlds], rad.
-
-    Returns:
-      f32[worlds, 3], m.
+      state: the worlds.
+      kinematics: of ``state``.
+      aim: the point to grip, m.
+      twist: of the hand against the object, rad.
     """
-    tool = kinematics.site_xpos[:, self._scene.tool_site]
-    off = geometry.norm(tool[:, :2] - aim[:, :2]) + off_by(twist, self._straight)
+    tool = kinematics.site_xpos[:, self.scene.tool_site]
+    off = geometry.norm(tool[:, :2] - aim[:, :2]) + off_by(twist, self.straight)
     height = geometry.funnel(off, aligned=ALIGNED, wide=FUNNEL)
     at_it = self.holds(state, kinematics, aim) | self.around(kinematics, aim, twist)
-    height = self._hover * jnp.where(at_it | self.is_open(state), height, 1.0)
-    down = geometry.up(aim[:, :2], aim[:, 2] - self.depth + height)
+    height = self.hover * jnp.where(at_it | self.is_open(state), height, 1.0)
+    down = geometry.at_height(aim[:, :2], aim[:, 2] - self.depth + height)
     return self._rise_first(tool, aim, down)
 
-  def above(self, kinematics: Kinematics, place: Array) -> Array:
-    """Tool position f32[worlds, 3] (m) high over a place; a low tool rises first."""
-    tool = kinematics.site_xpos[:, self._scene.tool_site]
-    return self._rise_first(tool, place, geometry.up(place[:, :2], self._travel))
+  def above(self, kinematics: Kinematics, place: Point) -> Point:
+    """Returns the tool position (m) high over a place; a low tool rises first."""
+    tool = kinematics.site_xpos[:, self.scene.tool_site]
+    return self._rise_first(tool, place, geometry.at_height(place[:, :2], self.travel))
 
   def _rise_first(self, tool: Array, place: Array, target: Array) -> Array:
-    low = tool[:, 2] < self._travel - 0.02
+    low = tool[:, 2] < self.travel - 0.02
     away = geometry.norm(tool[:, :2] - place[:, :2]) > FUNNEL
-    rise = geometry.up(tool[:, :2], self._travel)
+    rise = geometry.at_height(tool[:, :2], self.travel)
     return jnp.where((low & away)[:, None], rise, target)
 
-  def around(self, kinematics: Kinematics, point: Array, twist: Array) -> Array:
-    """bool[worlds]: where the hand may close to grip ``point`` (m)."""
-    near = geometry.norm(self.point(kinematics) - point) < self._near
-    return near & (jnp.abs(twist) < self._straight)
+  def around(self, kinematics: Kinematics, point: Point, twist: Angle) -> Mask:
+    """Checks whether the hand may close to grip ``point`` (m)."""
+    near = geometry.norm(self.point(kinematics) - point) < self.near
+    return near & (jnp.abs(twist) < self.straight)
 
 
-def off_by(twist: Array, straight: float = STRAIGHT) -> Array:
-  """How far off (m) a hand counts that is turned away by ``twist`` (rad)."""
+def off_by(twist: Angle, straight: float = STRAIGHT) -> Array:
+  """Returns the offset (m) that a twist of the hand (rad) counts as."""
   return LEVER * jnp.maximum(jnp.abs(twist) - straight / 2, 0.0)
 
 
-def grip(*, around: Array, held: Array, done: Array) -> Array:
-  """Gripper commands f32[worlds, 3] of the primitives of such tasks.
+def grip(*, around: Mask, held: Mask, done: Mask) -> Float[Array, "worlds 3"]:
+  """Returns the gripper commands of the primitives of a pick-and-place task.
 
-  The hand closes around the object, stays closed until the object is where it shall
-  be let go, and opens there; neutral is an open hand.
+  The hand closes around the object, holds it until it is where it is to be released,
+  and opens there. It is open in the neutral configuration.
 
   Args:
-    around: bool[worlds], the hand may close.
-    held: bool[worlds], the object is in the hand.
-    done: bool[worlds], the object is where it shall be let go.
+    around: the hand may close.
+    held: the object is in the hand.
+    done: the object is where it is to be released.
   """
   close = (held | around) & ~done
   return jnp.stack([close, close, jnp.zeros_like(close)], 1).astype(jnp.float32)
 
 
 def pick_and_place(
-  primitives: Array,
+  primitives: Float[Array, "worlds 3 7"],
   *,
-  held: Array,
-  done: Array,
-  is_open: Array,
+  held: Mask,
+  done: Mask,
+  is_open: Mask,
   withdraw: int = 2,
-) -> Array:
-  """Reach, close, carry, open, withdraw: the scripted expert of such tasks.
+) -> Float[Array, "worlds 7"]:
+  """Returns the actions of the scripted expert: reach, close, carry, open, withdraw.
 
   Args:
-    primitives: f32[worlds, 3, 7]; object, goal, neutral.
-    held: bool[worlds], the object is in the hand.
-    done: bool[worlds], the object is where it shall be let go.
-    is_open: bool[worlds], the hand has let go.
-    withdraw: which primitive leads the open hand away.
-
-  Returns:
-    f32[worlds, 7].
+    primitives: actions of the primitives object, goal and neutral.
+    held: the object is in the hand.
+    done: the object is where it is to be released.
+    is_open: the hand has let go.
+    withdraw: index of the primitive that leads the open hand away.
   """
   # While the fingers open, stay with the object.
   choice = jnp.where(done, jnp.where(is_open, withdraw, 0), jnp.where(held, 1, 0))
   return jnp.take_along_axis(primitives, choice[:, None, None], axis=1)[:, 0]
 
 
-def is_open(scene: Scene, state: PhysicsState, width: Array | float) -> Array:
-  """bool[worlds]: the pads are clear of something ``width`` (m) wide, on both sides."""
+def is_open(scene: Scene, state: PhysicsState, width: Array | float) -> Mask:
+  """Checks that the pads are clear of something ``width`` (m) wide on both sides."""
   return state.qpos[:, scene.gripper_qpos] < finger_angle(width + CLEARANCE)
 
 
-def is_gripping(scene: Scene, state: PhysicsState, width: Array | float) -> Array:
-  """bool[worlds]: the fingers have closed to ``width`` (m) and no further."""
+def is_gripping(scene: Scene, state: PhysicsState, width: Array | float) -> Mask:
+  """Checks that the fingers have closed to ``width`` (m) and no further."""
   angle = state.qpos[:, scene.gripper_qpos]
   low, high = finger_angle(width + TOLERANCE), finger_angle(width - TOLERANCE)
   return (angle > low) & (angle < high)
 
 
 def finger_angle(gap: Array | float) -> Array:
-  """Angle of the driven finger (rad) at which the pads are ``gap`` (m) apart."""
+  """Returns the angle (rad) of the driven finger for a gap (m) between the pads."""
   return jnp.arccos((gap / 2 - 0.0041) / FINGER_LENGTH) - FINGER_ANGLE
 
 
 def pinch_height(gap: Array | float) -> Array:
-  """How far (m) the pads' centre lies behind the tool site at this gap.
+  """Returns the distance (m) from the tool site back to the pads' center at a gap (m).
 
-  The pads travel forward on an arc as the fingers close; the site is where their
-  tips end when closed. Closed form of the maker's linkage.
+  The pads travel forward on an arc as the fingers close; the site is where their tips
+  end when closed. Closed form of the maker's linkage.
   """
   angle = finger_angle(gap) + FINGER_ANGLE
   return 0.1449 - (0.078 + FINGER_LENGTH * jnp.sin(angle))

@@ -1,19 +1,20 @@
-"""What a task is: a scene, resets, success, tool targets and a scripted expert.
+"""The interface of a task: scene, resets, success, tool targets, scripted expert.
 
-A task is one Python file, one MJCF file and one preset. Everything here is
-batched over worlds on the first axis; positions are in m in the world frame.
+A task is one Python file, one MJCF file and one preset. Everything is batched over
+worlds on the first axis; positions are in m in the world frame. Shapes in annotations
+are jaxtyping's and are not checked at run time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import importlib
 import pkgutil
 from typing import NamedTuple, Protocol, TypeVar
 
+from jaxtyping import Bool, Float, Int
 import numpy as np
 
-from apnpql_jax.config import check_name
+from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.sim.scene import Scene
@@ -21,16 +22,23 @@ from apnpql_jax.types import Array
 
 
 class ResetDraw(NamedTuple):
-  """Initial states as a task draws them, before they are settled."""
+  """Initial states as a task draws them, before they settle."""
 
-  qpos: np.ndarray  # f64[n, nq]
-  mocap_pos: np.ndarray  # f64[n, nmocap, 3], m
-  mocap_quat: np.ndarray  # f64[n, nmocap, 4]
-  variant: np.ndarray  # i64[n]: of the scene
+  qpos: Float[np.ndarray, "n nq"]
+  mocap_pos: Float[np.ndarray, "n nmocap 3"]  # m
+  mocap_quat: Float[np.ndarray, "n nmocap 4"]
+  variant: Int[np.ndarray, " n"]  # of the scene
+
+
+ToolTargets = tuple[
+  Float[Array, "worlds 3 3"], Float[Array, "worlds 3 3 3"], Float[Array, "worlds 3"]
+]
+"""Positions (m), rotations and gripper commands (1 closes) of the primitives target
+object, desired goal and neutral configuration."""
 
 
 class Task(Protocol):
-  """The four tasks of the paper (Sec. V-A) and any other are this."""
+  """The protocol of the paper's four tasks (Sec. V-A) and of any other."""
 
   name: str
   scene: Scene
@@ -39,53 +47,62 @@ class Task(Protocol):
     """Draws initial states uniformly within the task's ranges, without overlaps."""
     ...
 
-  def tool_targets(
+  def tool_targets(self, state: PhysicsState, kinematics: Kinematics) -> ToolTargets:
+    """Returns where each action primitive leads the tool from the present state."""
+    ...
+
+  def success(
     self, state: PhysicsState, kinematics: Kinematics
-  ) -> tuple[Array, Array, Array]:
-    """Where each action primitive wants the tool now, and what of the gripper.
+  ) -> Bool[Array, " worlds"]:
+    """Checks whether the task is solved, which is rewarded once with +1."""
+    ...
 
-    Returns:
-      positions f32[worlds, 3, 3] (m), rotations f32[worlds, 3, 3, 3] and gripper
-      commands f32[worlds, 3] (1 closes); rows are target object, desired goal and
-      neutral configuration.
+  def objects(self, state: PhysicsState) -> Float[Array, "worlds 3*k"]:
+    """Returns k points (m) that give the poses of objects and goals, for --obs state.
+
+    A direction is given by the point ``geometry.POINTER`` away along it.
     """
-    ...
-
-  def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:
-    """bool[worlds]: the task is solved; rewarded once with +1."""
-    ...
-
-  def objects(self, state: PhysicsState) -> Array:
-    """f32[worlds, 3 k]: k points (m) that tell the poses of objects and goals, for
-    --obs state. A direction is the point ``geometry.POINTER`` away in it."""
     ...
 
   def expert(
-    self, state: PhysicsState, kinematics: Kinematics, primitives: Array
-  ) -> Array:
-    """f32[worlds, 7]: the scripted policy, a feedback on the privileged state.
+    self,
+    state: PhysicsState,
+    kinematics: Kinematics,
+    primitives: Float[Array, "worlds 3 7"],
+  ) -> Float[Array, "worlds 7"]:
+    """Returns the actions of the scripted expert, which uses privileged state.
 
-    Args:
-      state: [worlds, ...].
-      kinematics: [worlds, ...].
-      primitives: f32[worlds, 3, 7], the actions that follow each primitive.
+    ``primitives`` are the actions that follow each primitive.
     """
     ...
 
 
-_REGISTRY: dict[str, Callable[[], Task]] = {}
 T = TypeVar("T", bound=Task)
+_REGISTRY: dict[str, type[Task]] = {}
 
 
-def register(task: type[T]) -> type[T]:
-  """Class decorator that makes a task known under its ``name``."""
+def register_task(task: type[T]) -> type[T]:
+  """Registers a task under its ``name``, as a class decorator.
+
+  Raises:
+    ConfigError: another class has this name. The same class of a reloaded module may
+      replace itself.
+  """
+  holder = _REGISTRY.setdefault(task.name, task)
+  if (holder.__module__, holder.__qualname__) != (task.__module__, task.__qualname__):
+    raise ConfigError(
+      f"task name {task.name!r} of {task.__module__}.{task.__qualname__} is taken by "
+      f"{holder.__module__}.{holder.__qualname__}; choose another name"
+    )
   _REGISTRY[task.name] = task
   return task
 
 
 def task_names() -> list[str]:
-  """Names of all registered tasks, sorted."""
-  _import_all()
+  """Returns the names of all tasks, sorted; imports the modules of this package."""
+  package = importlib.import_module("apnpql_jax.tasks")
+  for module in pkgutil.iter_modules(package.__path__):
+    importlib.import_module(f"apnpql_jax.tasks.{module.name}")
   return sorted(_REGISTRY)
 
 
@@ -97,9 +114,3 @@ def make_task(name: str) -> Task:
   """
   check_name("task", name, task_names())
   return _REGISTRY[name]()
-
-
-def _import_all() -> None:
-  package = importlib.import_module("apnpql_jax.tasks")
-  for module in pkgutil.iter_modules(package.__path__):
-    importlib.import_module(f"apnpql_jax.tasks.{module.name}")

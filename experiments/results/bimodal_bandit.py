@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import AgentConfig
+from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.types import Array, Observation, Transition
 
 PEAKS = ((0.6, 0.6), (-0.6, -0.6))
@@ -115,7 +115,7 @@ def draw(actions: dict[str, np.ndarray], path: Path) -> None:
     1, len(actions), figsize=(4 * len(actions), 4.3), sharey=True, layout="constrained"
   )
   for ax, (name, drawn) in zip(axes, actions.items(), strict=True):
-    ax.contourf(axis, axis, reward(grid), levels=12, cmap="Greys")
+    ax.contourf(axis, axis, reward(grid), levels=12, cmap="Grays")
     ax.plot(*drawn[:, :2].T, "o", ms=2.5, alpha=0.35, color="tab:blue", mew=0)
     peak = nearest(drawn)
     ax.set_title(

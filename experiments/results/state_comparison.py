@@ -32,11 +32,16 @@ import matplotlib.pyplot as plt
 import numpy as np
 from summarize import GOAL
 
-from apnpql_jax.config import TrainConfig, config_diff, config_from_json, format_diff
-from apnpql_jax.metrics import read_rows
-from apnpql_jax.options import Train, parse
-from apnpql_jax.presets import load_preset
-from apnpql_jax.run_folder import RunFolder, open_run
+from apnpql_jax.cli.options import Train, parse
+from apnpql_jax.config.files import (
+  config_diff,
+  config_from_json,
+  format_diff,
+  load_preset,
+)
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.runs.metrics import read_rows
+from apnpql_jax.runs.run_folder import RunFolder, open_run
 
 OUT = Path(__file__).resolve().with_suffix("")
 
@@ -181,14 +186,14 @@ def plot(found: dict[tuple[str, str], list[Result]]) -> None:
     1, len(TASKS), figsize=(3.4 * len(TASKS), 3.2), sharey=True, layout="constrained"
   )
   for panel, task in zip(panels, TASKS, strict=True):
-    for colour, row in enumerate(PAPER):
+    for color, row in enumerate(PAPER):
       if runs := found.get((task, row)):
         curves = [run["evaluations"] for run in runs]
         rates = 100 * np.array([[x["eval/success_rate"] for x in c] for c in curves])
         steps = [x["step"] / 1000 for x in curves[0]]
-        panel.plot(steps, rates.mean(0), ".-", color=f"C{colour}", label=row)
+        panel.plot(steps, rates.mean(0), ".-", color=f"C{color}", label=row)
         panel.fill_between(
-          steps, rates.min(0), rates.max(0), color=f"C{colour}", alpha=0.2, linewidth=0
+          steps, rates.min(0), rates.max(0), color=f"C{color}", alpha=0.2, linewidth=0
         )
     panel.set(title=task, xlabel="1,000 environment steps")
     panel.set(xlim=(0, STEPS / 1000), ylim=(-2, 102))

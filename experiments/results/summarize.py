@@ -19,8 +19,8 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-from apnpql_jax.metrics import read_evaluations
-from apnpql_jax.run_folder import RunFolder, open_run
+from apnpql_jax.runs.metrics import read_evaluations
+from apnpql_jax.runs.run_folder import RunFolder, open_run
 
 COLUMNS = ("step", "time/wall_s", "eval/success_rate", "eval/episodes")
 GOAL = 0.8

@@ -1,0 +1,1 @@
+"""The columns of Table I; one file each, and their shared candidates."""

@@ -1,0 +1,150 @@
+"""Where actions come from and how they are weighed (Table I, column "policy")."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from apnpql_jax.agents.columns.candidates import Candidates, clip_action
+from apnpql_jax.agents.heads import Heads
+from apnpql_jax.dists import boltzmann
+from apnpql_jax.dists.action import ActionDistribution
+from apnpql_jax.dists.gmm import GripperGMM
+from apnpql_jax.types import ARM_DOF, Array
+
+CEM_ITERATIONS = 2
+CEM_SAMPLES = 64
+CEM_ELITES = 6
+"""Of the cross-entropy method, as in QT-Opt (Kalashnikov 2018)."""
+
+CEM_MIN_STD = 0.01
+"""Floor of the deviation of the elites, rad/s, so that the next draw still differs."""
+
+
+def non_parametric(
+  heads: Heads,
+  prior: ActionDistribution,
+  key: Array,
+  *,
+  num_samples: int,
+  greedy: bool = False,
+) -> Candidates:
+  """q = b exp(Q / alpha) / Z by self-normalized importance sampling (paper Eq. 6).
+
+  Args:
+    heads: the networks at the states.
+    prior: the regularizer b at the same states.
+    key: random key.
+    num_samples: candidates S per state.
+    greedy: all weight on the one of highest value.
+
+  Returns:
+    Candidates drawn from ``prior`` with weights softmax(Q / alpha); no gradients.
+  """
+  heads, prior = heads.frozen(), jax.lax.stop_gradient(prior)
+  samples = prior.sample(key, num_samples)
+  actions, outputs, q_values = _evaluate(heads, samples)
+  alpha = heads.alpha()
+  weights = boltzmann.importance_weights(q_values, alpha)
+  if greedy:
+    weights = _all_on_the_highest(q_values)
+  return Candidates(samples, actions, outputs, q_values, weights, prior, 1.0 / alpha)
+
+
+def parametric(
+  heads: Heads,
+  prior: ActionDistribution,
+  key: Array,
+  *,
+  num_samples: int,
+  greedy: bool = False,
+) -> Candidates:
+  """pi_psi: half as many draws of the arm, each with the gripper open and closed.
+
+  The gripper is summed over exactly: the two share the weight of their draw as pi
+  has it. Gradients reach psi through draws and weights, and nothing else.
+
+  Args:
+    heads: the networks at the states.
+    prior: not needed.
+    key: random key.
+    num_samples: candidates S per state, rounded down to an even number.
+    greedy: the mean in place of draws, all weight on the likelier gripper.
+  """
+  del prior
+  policy = heads.policy()
+  drawn = policy.sample(key, 1 if greedy else num_samples // 2)
+  if greedy:
+    drawn = drawn.at[..., :ARM_DOF].set(policy.mean[None, ..., 0, :])
+  both = jnp.stack([drawn.at[..., -1].set(gripper) for gripper in (0.0, 1.0)])
+  samples = both.reshape(-1, *drawn.shape[1:])
+  actions, outputs, q_values = _evaluate(heads.frozen(), samples)
+  log_prob = policy.log_prob(samples).reshape(both.shape[:-1])
+  weights = jax.nn.softmax(log_prob, axis=0).reshape(q_values.shape) / drawn.shape[0]
+  if greedy:
+    weights = _all_on_the_highest(weights)
+  tilt = jnp.zeros(q_values.shape[1:])
+  return Candidates(samples, actions, outputs, q_values, weights, policy, tilt)
+
+
+def cem(
+  heads: Heads,
+  prior: ActionDistribution,
+  key: Array,
+  *,
+  num_samples: int,
+  greedy: bool = False,
+) -> Candidates:
+  """The best action that the cross-entropy method finds (QT-Opt), from draws of b.
+
+  Args:
+    heads: the networks at the states.
+    prior: the regularizer b: the first draw is its.
+    key: random key.
+    num_samples: not needed; ``CEM_SAMPLES`` belong to the method.
+    greedy: not needed; the method is.
+
+  Returns:
+    The last draw, all weight on its best action; no gradients.
+  """
+  del num_samples, greedy
+  heads, base = heads.frozen(), jax.lax.stop_gradient(prior)
+  *keys, last = jax.random.split(key, CEM_ITERATIONS)
+  for k in keys:
+    samples = base.sample(k, CEM_SAMPLES)
+    base = _refit(samples, _evaluate(heads, samples)[2], heads.config.policy_min_prob)
+  samples = base.sample(last, CEM_SAMPLES)
+  actions, outputs, q_values = _evaluate(heads, samples)
+  weights = _all_on_the_highest(q_values)
+  tilt = jnp.zeros(q_values.shape[1:])
+  return Candidates(samples, actions, outputs, q_values, weights, base, tilt)
+
+
+def _evaluate(heads: Heads, samples: Array) -> tuple[Array, Array, Array]:
+  """Clipped actions, outputs of the value head, Q, each [S, *b, ...]."""
+  actions = clip_action(samples)
+  outputs = heads.z(actions)
+  return actions, outputs, heads.networks.value(outputs)
+
+
+def _all_on_the_highest(x: Array) -> Array:
+  """Weights f32[S, *b] that pick the highest of f32[S, *b]."""
+  return jax.nn.one_hot(jnp.argmax(x, axis=0), x.shape[0], axis=0, dtype=x.dtype)
+
+
+def _refit(samples: Array, q_values: Array, min_prob: float) -> GripperGMM:
+  """One diagonal Gaussian, and a probability to close, of the best few of S draws."""
+  elites = jax.lax.top_k(jnp.moveaxis(q_values, 0, -1), CEM_ELITES)[1]
+  elites = jnp.moveaxis(elites, -1, 0)[..., None]
+  best = clip_action(jnp.take_along_axis(samples, elites, axis=0))
+  mean, std = jnp.mean(best, axis=0), jnp.std(best, axis=0)
+  close = jnp.clip(mean[..., -1], min_prob, 1.0 - min_prob)
+  joint = jnp.arange(ARM_DOF)
+  scale = jnp.zeros((*close.shape, 1, ARM_DOF, ARM_DOF))
+  std = jnp.maximum(std[..., None, :-1], CEM_MIN_STD)
+  return GripperGMM(
+    logits=jnp.zeros((*close.shape, 1)),
+    mean=mean[..., None, :-1],
+    scale_tril=scale.at[..., joint, joint].set(std),
+    gripper_logits=(jnp.log(close) - jnp.log1p(-close))[..., None],
+  )

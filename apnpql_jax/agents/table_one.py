@@ -1,0 +1,143 @@
+"""The rows of the paper's Table I.
+
+An algorithm is one choice per column; the learner calls the columns and knows no
+algorithm by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import dataclasses
+
+from apnpql_jax.agents.columns.candidates import Candidates
+from apnpql_jax.agents.columns.policy import cem, non_parametric, parametric
+from apnpql_jax.agents.columns.policy_evaluation import (
+  TD0,
+  Categorical,
+  ClippedDoubleQ,
+  Evaluation,
+  Retrace,
+)
+from apnpql_jax.agents.columns.policy_update import (
+  Improvement,
+  forward_kl,
+  none,
+  reverse_kl,
+)
+from apnpql_jax.agents.columns.regularizer import (
+  Losses,
+  behavior_prior,
+  fit_advantageous,
+  fit_candidates,
+  no_update,
+  previous_policy,
+  uniform,
+)
+from apnpql_jax.agents.heads import GROUPS
+from apnpql_jax.config.schema import AgentConfig
+from apnpql_jax.dists.action import ActionDistribution
+from apnpql_jax.errors import ConfigError, check_name
+
+
+@dataclasses.dataclass(frozen=True)
+class Algorithm:
+  """One row of Table I; the columns are functions."""
+
+  regularizer: Callable[..., ActionDistribution]
+  """b: (heads, target network's heads) -> distribution the policy is kept close to."""
+
+  policy: Callable[..., Candidates]
+  """What acts and is evaluated: (heads, b, key, num_samples, greedy) -> weighted
+  candidates."""
+
+  regularizer_update: Callable[..., Losses]
+  """(heads, b, candidates, batch, key, nu) -> losses of b and nu; the candidates are
+  those of the improved policy."""
+
+  policy_update: Callable[..., Improvement]
+  """(heads, b, key) -> the improved policy, and the losses of psi and alpha."""
+
+  policy_evaluation: Callable[[AgentConfig], Evaluation]
+  """Value head, target and loss."""
+
+  def groups(self, config: AgentConfig) -> tuple[str, ...]:
+    """Parameter groups that the columns read, in the order of ``GROUPS``."""
+    absent = {
+      "bp": self.regularizer is not behavior_prior,
+      "policy": self.policy is not parametric,
+      "alpha": config.temperature == "fixed",
+    }
+    return tuple(group for group in GROUPS if not absent.get(group))
+
+
+ALGORITHMS = {
+  # regularizer      policy          regularizer       policy      policy
+  #                                  update            update      evaluation
+  "ap_npql": Algorithm(
+    behavior_prior, non_parametric, fit_candidates,   none,       Categorical,
+  ),
+  "ap_mpo": Algorithm(
+    behavior_prior, parametric,     fit_candidates,   forward_kl, Categorical,
+  ),
+  "ap_sac": Algorithm(
+    behavior_prior, parametric,     fit_candidates,   reverse_kl, Categorical,
+  ),
+  "abm_mpo": Algorithm(
+    behavior_prior, parametric,     fit_advantageous, forward_kl, TD0,
+  ),
+  "svg_prior": Algorithm(
+    behavior_prior, parametric,     fit_candidates,   reverse_kl, Retrace,
+  ),
+  "mpo": Algorithm(
+    previous_policy, parametric,     no_update,        forward_kl, Retrace,
+  ),
+  "sac": Algorithm(
+    uniform,         parametric,     no_update,        reverse_kl, ClippedDoubleQ,
+  ),
+  "ap_cem": Algorithm(
+    behavior_prior, cem,            fit_candidates,   none,       ClippedDoubleQ,
+  ),
+}  # fmt: skip
+"""The last row is not in the table: QT-Opt's policy, for b with action primitives."""
+
+EVALUATIONS = {
+  "categorical": Categorical,
+  "td0": TD0,
+  "retrace": Retrace,
+  "clipped_double_q": ClippedDoubleQ,
+}
+"""Values of ``agent.policy_evaluation`` beside "row"."""
+
+
+def algorithm_of(config: AgentConfig) -> Algorithm:
+  """The row that ``config`` names, with the columns that it replaces.
+
+  Raises:
+    ConfigError: no such row; the message lists the valid names. Or Retrace for a
+      policy without a density.
+  """
+  check_name("agent.algorithm", config.algorithm, tuple(ALGORITHMS))
+  row = ALGORITHMS[config.algorithm]
+  if config.regularizer == "uniform":
+    row = dataclasses.replace(row, regularizer=uniform, regularizer_update=no_update)
+  if config.policy_evaluation != "row":
+    evaluation = EVALUATIONS[config.policy_evaluation]
+    row = dataclasses.replace(row, policy_evaluation=evaluation)
+  if row.policy is cem and row.policy_evaluation is Retrace:
+    raise ConfigError(
+      "agent.policy_evaluation retrace needs the density of the policy, and that of "
+      "the best of many draws is not known; choose another for ap_cem"
+    )
+  return row
+
+
+def epsilon_bounds() -> dict[str, tuple[str, ...]]:
+  """Name of each row -> settings that say how many candidates q weighs somewhere; below
+  the log of each of them epsilon must lie."""
+
+  def bounds(row: Algorithm) -> tuple[str, ...]:
+    target = ("target_samples",) if row.policy is non_parametric else ()
+    update = ("policy_samples",) if row.policy_update is not reverse_kl else ()
+    return (*target, *update)
+
+  return {name: bounds(row) for name, row in ALGORITHMS.items()}

@@ -1,0 +1,238 @@
+"""Commands of ``apnpql``: each takes its options and returns its result.
+
+JAX, MuJoCo and the modules that need them are imported inside the functions, so that
+help and errors are fast.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from apnpql_jax.cli.options import Collect, Convert, Evaluate, List, Repeat, Train
+from apnpql_jax.config import files
+from apnpql_jax.config.checks import BACKENDS, validate
+from apnpql_jax.config.schema import EnvConfig, TrainConfig
+from apnpql_jax.console import say
+from apnpql_jax.errors import ConfigError, check_name
+from apnpql_jax.runs import run_folder
+
+if TYPE_CHECKING:
+  from jax.sharding import Mesh
+
+Json = dict[str, Any]
+
+
+def base_config(args: Train) -> TrainConfig:
+  """Returns the settings that ``train`` starts from: those of the preset or the run.
+
+  Raises:
+    ConfigError: The options contradict each other or name no preset.
+    FileError: The run cannot be read.
+  """
+  if args.resume is not None and (args.run is not None or args.overwrite):
+    raise ConfigError("--resume names the run itself; leave out --run and --overwrite")
+  if args.preset:
+    return files.load_preset(args.preset)
+  if args.resume is None:
+    names = ", ".join(files.preset_names())
+    raise ConfigError(f"train needs a preset; choose from {names}")
+  return run_folder.load_run_config(args.resume, say)
+
+
+def train(args: Train) -> Json:
+  """Checks all options, then trains or resumes a run and returns its summary."""
+  config = _with_shortcuts(args)
+  run_dir = args.resume or args.run or run_folder.new_run_dir(args.preset)
+  if args.resume is None:
+    run_folder.check_free(run_dir, overwrite=args.overwrite)
+  validate(config)
+  if args.resume is not None:
+    run_folder.check_resumable(args.resume, config)
+  mesh = _mesh(args)
+
+  from apnpql_jax import devices, tasks
+  from apnpql_jax.agents import table_one
+  from apnpql_jax.training.train import train as run_training
+
+  validate(
+    config,
+    tasks=tasks.task_names(),
+    algorithms=table_one.epsilon_bounds(),
+    memory_bytes=devices.available_memory(),
+    devices=mesh.size if mesh else 1,
+  )
+  summary = run_training(
+    config,
+    run_dir,
+    resume=args.resume is not None,
+    overwrite=args.overwrite,
+    mesh=mesh,
+  )
+  return summary if devices.is_primary() else {}
+
+
+def evaluate(args: Evaluate) -> Json:
+  """Plays held-out episodes with a checkpoint of a run."""
+  if not args.run:
+    raise ConfigError("evaluate needs a run folder: apnpql evaluate RUN")
+  _check_episodes(args.episodes, args.seed)
+  _check_video(args.video)
+  if args.backend is not None:
+    check_name("backend", args.backend, BACKENDS)
+  run_folder.load_run_config(Path(args.run), say)
+
+  from apnpql_jax.training.evaluate import evaluate as evaluate_run
+
+  return evaluate_run(
+    Path(args.run),
+    episodes=args.episodes,
+    seed=args.seed,
+    backend=args.backend,
+    step=_checkpoint_step(args),
+    greedy=args.greedy,
+    video=args.video,
+  )
+
+
+def collect(args: Collect) -> Json:
+  """Plays episodes with the scripted expert of a task."""
+  _check_episodes(args.episodes, args.seed)
+  _check_video(args.video)
+  check_name("backend", args.backend, BACKENDS)
+  if not 0.0 <= args.noise < float("inf"):
+    raise ConfigError(f"--noise {args.noise} must be a finite number of at least 0")
+  # The expert acts on privileged poses, so images are not needed.
+  env = dataclasses.replace(_task_env(args.task), backend=args.backend, obs="state")
+
+  from apnpql_jax.training import expert
+  from apnpql_jax.training.evaluate import evaluate_expert
+
+  settings = {"episodes": args.episodes, "seed": args.seed, "noise": args.noise}
+  figures = evaluate_expert(env, video=args.video, **settings)
+  if args.save is not None:
+    figures |= expert.save_expert(args.save, env, **settings)
+  return figures
+
+
+def convert(args: Convert) -> Json:
+  """Converts recorded joint trajectories into demonstrations."""
+  if not args.out:
+    raise ConfigError("usage: apnpql convert REC.npz TASK OUT.npz")
+  env = _task_env(args.task)
+
+  from apnpql_jax import tasks
+  from apnpql_jax.data import demonstrations, real_arm
+
+  scene, period_s = tasks.make_task(args.task).scene, env.control_period_s
+  demos = real_arm.convert(Path(args.recording), scene, period_s=period_s)
+  return demonstrations.save(
+    Path(args.out), demos, task=args.task, control_period_s=period_s
+  )
+
+
+def repeat(args: Repeat) -> Json:
+  """Repeats the update that stopped a run and names what was not finite."""
+  if not args.file:
+    raise ConfigError("repeat needs a file: apnpql repeat RUN/faults/step_<n>.npz")
+  path = Path(args.file).absolute()
+  run_folder.load_run_config(path.parent.parent, say)
+
+  from apnpql_jax.training import faults
+
+  return faults.repeat(path)
+
+
+def list_names(args: List) -> Json:
+  """Returns the names that other commands accept, or a contact report of each task."""
+  from apnpql_jax import tasks
+  from apnpql_jax.agents import table_one
+
+  names = tasks.task_names()
+  if args.contacts:
+    from apnpql_jax.envs.contact_report import contact_report
+
+    return {name: contact_report(tasks.make_task(name)) for name in names}
+  return {
+    "tasks": names,
+    "presets": files.preset_names(),
+    "algorithms": list(table_one.ALGORITHMS),
+    "backends": list(BACKENDS),
+  }
+
+
+def _with_shortcuts(args: Train) -> TrainConfig:
+  """Returns the settings with --backend, --obs and --algorithm applied."""
+  config = args.config
+  env = {"backend": args.backend, "obs": args.obs}
+  env = {name: value for name, value in env.items() if value is not None}
+  config = dataclasses.replace(config, env=dataclasses.replace(config.env, **env))
+  if args.algorithm is None:
+    return config
+  agent = dataclasses.replace(config.agent, algorithm=args.algorithm)
+  return dataclasses.replace(config, agent=agent)
+
+
+def _mesh(args: Train) -> Mesh | None:
+  """Returns the devices to train on; waits for the other processes, if any.
+
+  Called before anything is written, so that all processes find the same run folder.
+  """
+  if args.coordinator and args.run is None and args.resume is None:
+    raise ConfigError("processes of one run must be given the same --run")
+  if not args.coordinator and (args.processes, args.process) != (None, None):
+    raise ConfigError("--processes and --process need a --coordinator")
+  from apnpql_jax import devices
+
+  if not args.coordinator:
+    return devices.make_mesh(args.devices)
+  devices.join(args.coordinator, args.processes, args.process)
+  return devices.make_mesh(0)
+
+
+def _task_env(task: str) -> EnvConfig:
+  """Returns the environment of a task's preset, or the default one for the task."""
+  from apnpql_jax import tasks
+
+  check_name("task", task, tasks.task_names())
+  preset = task in files.preset_names()
+  env = files.load_preset(task).env if preset else EnvConfig()
+  return dataclasses.replace(env, task=task)
+
+
+def _checkpoint_step(args: Evaluate) -> int | None:
+  """Returns the step of the checkpoint asked for; None for the newest."""
+  if args.checkpoint == "newest":
+    return None
+  if args.checkpoint == "best":
+    from apnpql_jax.runs.checkpoint_reader import best_step
+
+    return best_step(Path(args.run))
+  if args.checkpoint.isdigit():
+    return int(args.checkpoint)
+  raise ConfigError(
+    f"unknown --checkpoint {args.checkpoint!r}; choose from newest, best, or a step"
+  )
+
+
+def _check_episodes(episodes: int, seed: int) -> None:
+  if episodes < 1:
+    raise ConfigError(f"--episodes {episodes} must be at least 1")
+  if not 0 <= seed < 2**31:
+    raise ConfigError(f"--seed {seed} must be within 0 and 2**31 - 1")
+
+
+def _check_video(path: Path | None) -> None:
+  if path is None:
+    return
+  if path.suffix not in (".mp4", ".gif"):
+    raise ConfigError(f"--video {path} must end in .mp4 or .gif")
+  try:
+    folder = next(p for p in path.absolute().parents if p.exists())
+    fit = folder.is_dir() and os.access(folder, os.W_OK) and not path.is_dir()
+  except OSError as error:
+    raise ConfigError(f"--video {path}: {error}") from None
+  if not fit:
+    raise ConfigError(f"--video {path} cannot be written")

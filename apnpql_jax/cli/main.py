@@ -1,0 +1,154 @@
+"""Entry point of ``apnpql``: parses options, runs the command, shows its result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Sequence
+import contextlib
+import json
+import math
+import os
+import signal
+import sys
+from typing import Any
+
+from apnpql_jax import errors, runtime
+from apnpql_jax.cli import commands
+from apnpql_jax.cli.commands import Json
+from apnpql_jax.cli.options import (
+  Collect,
+  Convert,
+  Evaluate,
+  List,
+  Repeat,
+  Train,
+  parse,
+)
+from apnpql_jax.config import files
+from apnpql_jax.console import say
+from apnpql_jax.errors import ConfigError, UserError, check_name
+from apnpql_jax.runs.signals import Signals
+from apnpql_jax.version import __version__
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+  """Runs one command line and returns its exit code.
+
+  0 is success, 2 bad input, 3 a run that had to stop (disk full, values not finite),
+  130 Ctrl-C and 143 SIGTERM, with the run saved. All but 0 print one line to stderr.
+  """
+  runtime.configure()
+  args = list(sys.argv[1:] if argv is None else argv)
+  try:
+    if not args:
+      raise ConfigError(f"name a command: {', '.join(_COMMANDS)} (see apnpql --help)")
+    if args[0] in ("-h", "--help"):
+      print(_help())
+      return 0
+    if args[0] == "--version":
+      print(__version__)
+      return 0
+    check_name("command", args[0], list(_COMMANDS))
+    kind, command = _COMMANDS[args[0]]
+    options = _parse(kind, args)
+    with Signals("interrupted"), _json_only(options.json) as write:
+      result = command(options)
+      if result:  # Empty in all but the first of several processes.
+        write(_to_json(result) if options.json else _show(result))
+    return 0
+  except UserError as error:
+    say(f"apnpql: {' '.join(str(error).split())}")
+    return 2
+  except errors.RunStopped as stop:
+    say(f"apnpql: {stop}")
+    if stop.code == errors.FAILED:
+      # Threads of a failed save may wait for each other for minutes.
+      os._exit(stop.code)
+    return stop.code
+  except KeyboardInterrupt:
+    return errors.INTERRUPTED + signal.SIGINT
+  except BrokenPipeError:  # The reader of our output has exited, as `head` does.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    return 0
+
+
+def _parse(kind: type[Any], args: Sequence[str]) -> Any:
+  """Returns the options of a command; those of ``train`` override its preset or run."""
+  name, *rest = args
+  if kind is not Train:
+    return parse(kind, name, rest)
+  # Parsing ends here for --help, which shows the settings of a preset named before it.
+  presets = [arg for arg in rest if arg in files.preset_names()]
+  default = Train(config=files.load_preset(presets[0])) if presets else None
+  base = commands.base_config(parse(Train, name, rest, default=default))
+  return parse(Train, name, rest, default=Train(config=base))
+
+
+@contextlib.contextmanager
+def _json_only(enabled: bool) -> Generator[Callable[[str], Any], None, None]:
+  """Yields a function that prints the result; with JSON, all else goes to stderr.
+
+  Redirects the file descriptor, because libraries print below Python too.
+  """
+  if not enabled:
+    yield print
+    return
+  sys.stdout.flush()
+  stdout = os.dup(1)
+  os.dup2(2, 1)
+  try:
+    yield lambda text: os.write(stdout, (text + "\n").encode())
+  finally:
+    sys.stdout.flush()
+    os.dup2(stdout, 1)
+    os.close(stdout)
+
+
+def _to_json(result: Json) -> str:
+  return json.dumps(_plain(result), allow_nan=False)
+
+
+def _plain(value: Any) -> Any:
+  """Returns ``value`` for JSON: arrays as lists, paths as text, NaN as null."""
+  if hasattr(value, "tolist"):  # NumPy and JAX arrays.
+    value = value.tolist()
+  if isinstance(value, dict):
+    return {str(key): _plain(item) for key, item in value.items()}
+  if isinstance(value, list | tuple):
+    return [_plain(item) for item in value]
+  if isinstance(value, float) and not math.isfinite(value):
+    return None
+  return value if isinstance(value, str | int | float | None) else str(value)
+
+
+def _show(result: Json) -> str:
+  """Returns the result as one line per entry, for people."""
+  width = max(map(len, result))
+  return "\n".join(f"{name:<{width}}  {_text(x)}" for name, x in result.items())
+
+
+def _text(value: Any) -> str:
+  if isinstance(value, dict):  # A contact report.
+    value = [
+      f"{number:,.0f} {name.replace('_', ' ')}" for name, number in value.items()
+    ]
+  if isinstance(value, list):
+    return ", ".join(value) or "none"
+  return str(value)
+
+
+def _help() -> str:
+  lines = ["usage: apnpql COMMAND [options]", ""]
+  for name, (kind, _) in _COMMANDS.items():
+    lines.append(f"  {name:<9} {(kind.__doc__ or '').splitlines()[0]}")
+  lines += ["", "apnpql COMMAND --help shows its options."]
+  return "\n".join(lines)
+
+
+_COMMANDS: dict[str, tuple[type[Any], Callable[[Any], Json]]] = {
+  "train": (Train, commands.train),
+  "evaluate": (Evaluate, commands.evaluate),
+  "collect": (Collect, commands.collect),
+  "convert": (Convert, commands.convert),
+  "repeat": (Repeat, commands.repeat),
+  "list": (List, commands.list_names),
+}

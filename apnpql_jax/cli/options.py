@@ -1,0 +1,226 @@
+"""Command-line options, and their parsing with one-line errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import contextlib
+import dataclasses
+import io
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+import tyro
+
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def _default_hint(text: str) -> object:
+  return tyro.conf.arg(help_behavior_hint=text)
+
+
+_Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+_Json = Annotated[
+  _Flag, tyro.conf.arg(help="Print only one JSON object on standard output.")
+]
+_OfPreset = Annotated[str | None, _default_hint("(default: as in the preset)")]
+_Count = Annotated[int | None, _default_hint("")]
+_File = Annotated[Path | None, _default_hint("")]
+_Video = Annotated[
+  Path | None,
+  tyro.conf.arg(
+    help="Also write a video of the first four episodes to this .mp4 or .gif file.",
+    help_behavior_hint="",
+  ),
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+  """Trains an agent: apnpql train PRESET [options].
+
+  Every setting of the preset can be overridden, e.g. --agent.epsilon 0.5.
+  """
+
+  preset: tyro.conf.Positional[str] = ""
+  """Preset to start from; `apnpql list` shows all."""
+
+  run: Annotated[
+    Path | None, _default_hint("(default: first free runs/PRESET-<n>)")
+  ] = None
+  """Run folder to create."""
+
+  resume: _File = None
+  """Run folder to resume from its latest checkpoint."""
+
+  overwrite: _Flag = False
+  """Replace the existing run in --run."""
+
+  backend: _OfPreset = None
+  """Short for --env.backend: auto, mjx or native."""
+
+  obs: _OfPreset = None
+  """Short for --env.obs: pixels or state."""
+
+  algorithm: _OfPreset = None
+  """Short for --agent.algorithm; `apnpql list` shows all."""
+
+  devices: int = 1
+  """Devices that share the worlds and batches; 0: all (always with --coordinator)."""
+
+  coordinator: str = ""
+  """Address and port of the first of several processes, or auto to take it and the next
+  two options from the batch system; see docs/scaling.md."""
+
+  processes: _Count = None
+  """Number of processes that share the run."""
+
+  process: _Count = None
+  """Index of this process, from 0."""
+
+  json: _Json = False
+
+  config: Annotated[TrainConfig, tyro.conf.arg(name="")] = dataclasses.field(
+    default_factory=TrainConfig
+  )
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluate:
+  """Plays held-out episodes with a trained agent: apnpql evaluate RUN [options]."""
+
+  run: tyro.conf.Positional[str] = ""
+  """Run folder."""
+
+  checkpoint: str = "newest"
+  """Checkpoint: newest, best (highest success rate in training) or its step."""
+
+  episodes: int = 200
+  """Number of episodes."""
+
+  seed: int = 0
+  """Random seed of the episodes and the policy."""
+
+  greedy: _Flag = False
+  """Take the best candidate, or a parametric policy's mean, instead of sampling."""
+
+  backend: Annotated[str | None, _default_hint("(default: as in training)")] = None
+  """Physics engine: auto, mjx or native."""
+
+  video: _Video = None
+
+  json: _Json = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Collect:
+  """Plays episodes with the scripted expert: apnpql collect TASK [options]."""
+
+  task: tyro.conf.Positional[str] = ""
+  """Task to play; `apnpql list` shows all."""
+
+  episodes: int = 200
+  """Number of episodes."""
+
+  seed: int = 0
+  """Random seed of the episodes and the noise."""
+
+  backend: str = "auto"
+  """Physics engine: auto, mjx or native."""
+
+  noise: float = 0.0
+  """Standard deviation of the noise on the expert's joint velocities (rad/s)."""
+
+  save: _File = None
+  """Also save as many episodes from training resets as a file of demonstrations."""
+
+  video: _Video = None
+
+  json: _Json = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Convert:
+  """Converts a recording to demonstrations: apnpql convert REC.npz TASK OUT.npz."""
+
+  recording: tyro.conf.Positional[str] = ""
+  """Joint trajectories and object poses; see docs/demonstrations.md for the format."""
+
+  task: tyro.conf.Positional[str] = ""
+  """Task of the recording; `apnpql list` shows all."""
+
+  out: tyro.conf.Positional[str] = ""
+  """File to write, for --replay.demonstrations."""
+
+  json: _Json = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Repeat:
+  """Repeats an update that was not finite: apnpql repeat RUN/faults/step_<n>.npz."""
+
+  file: tyro.conf.Positional[str] = ""
+  """File that a run wrote when it stopped, still in its run folder."""
+
+  json: _Json = False
+
+
+@dataclasses.dataclass(frozen=True)
+class List:
+  """Lists the tasks, presets, algorithms and backends."""
+
+  contacts: _Flag = False
+  """Report contacts and physics speed of every scene instead; compiles for minutes."""
+
+  json: _Json = False
+
+
+def parse(kind: type[T], name: str, argv: Sequence[str], default: T | None = None) -> T:
+  """Parses the options of one command.
+
+  Args:
+    kind: One of the dataclasses above.
+    name: Command name, for help and errors.
+    argv: Arguments after the command name.
+    default: Defaults of the options; those of ``kind`` if None.
+
+  Raises:
+    ConfigError: An option is unknown, incomplete or unreadable; the message is tyro's
+      error box on one line.
+    SystemExit: ``--help`` was given, and the help printed.
+  """
+  errors = io.StringIO()
+  try:
+    with contextlib.redirect_stderr(errors):
+      return tyro.cli(
+        kind,
+        args=list(argv),
+        prog=f"apnpql {name}",
+        default=kind() if default is None else default,
+        config=(tyro.conf.DisallowNone,),
+      )
+  except SystemExit as stop:
+    if stop.code in (0, None):  # --help was printed.
+      raise
+    raise ConfigError(
+      f"{_unbox(errors.getvalue())} (see apnpql {name} --help)"
+    ) from None
+
+
+def _unbox(text: str) -> str:
+  """Returns the message of tyro's error box: its first section and first suggestion."""
+  rows = [line.strip("│ ") for line in text.splitlines() if line.startswith("│")]
+  sections: list[list[str]] = [[]]
+  for row in rows:
+    if row and not row.strip("─"):
+      sections.append([])
+    else:
+      sections[-1].append(row)
+  message = " ".join(sections[0]) or " ".join(text.split()) or "bad options"
+  for section in sections[1:]:
+    options = [row for row in section if row.startswith("--")]
+    if section[0].startswith("Perhaps you meant") and options:
+      message += f"; perhaps you meant {options[0]}"
+  return message

@@ -1,0 +1,1 @@
+"""Settings, their checks and their files; imports neither JAX nor MuJoCo."""

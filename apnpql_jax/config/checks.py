@@ -1,0 +1,250 @@
+"""Checks of a configuration before anything is built.
+
+The valid tasks and algorithms are passed in, so that reading a configuration imports
+neither the simulator nor the learner.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import math
+from typing import Any
+
+from apnpql_jax.config import codec
+from apnpql_jax.config.ranges import validate_ranges
+from apnpql_jax.config.schema import AgentConfig, EnvConfig, TrainConfig
+from apnpql_jax.errors import ConfigError, check_name
+
+BACKENDS = ("auto", "mjx", "native")
+OBSERVATIONS = ("pixels", "state")
+EVALUATIONS = ("row", "categorical", "td0", "retrace", "clipped_double_q")
+IMAGE_FEATURES = ("map", "keypoints", "both")
+
+_CHOICES = {
+  "env.backend": BACKENDS,
+  "env.obs": OBSERVATIONS,
+  "agent.temperature": ("state", "shared", "fixed"),
+  "agent.regularizer": ("row", "uniform"),
+  "agent.policy_evaluation": EVALUATIONS,
+  "agent.prior_mean": ("primitives", "learned"),
+  "agent.global_features": IMAGE_FEATURES,
+  "agent.wrist_features": IMAGE_FEATURES,
+}
+
+_POSITIVE = (
+  "env.worlds env.time_limit_s env.control_period_s "
+  "agent.n_step agent.learning_rate_e agent.epsilon "
+  "agent.feature_dim agent.max_grad_norm agent.patch_channels agent.conv_channels "
+  "agent.ap_delta agent.min_std agent.policy_min_std "
+  "agent.initial_alpha agent.min_alpha "
+  "replay.capacity replay.batch_size total_steps rollout_length "
+  "updates_per_iteration eval_every eval_episodes checkpoint_every keep_checkpoints "
+  "max_skipped_updates"
+).split()
+_NOT_NEGATIVE = (
+  "agent.learning_rate_m agent.learning_rate_alpha agent.learning_rate_nu "
+  "agent.lambda_ap agent.m_step_delay agent.residual_blocks replay.expert_steps "
+  "replay.expert_noise seed save_replay_every"
+).split()
+_BOUNDS = {
+  # A quarter of the bank is held out for evaluation. Bank and atoms are computed on the
+  # host before memory is checked.
+  "env.bank_rows": (16, 1 << 20),
+  "agent.num_atoms": (2, 10_000),
+  "agent.target_samples": (2, math.inf),
+  "agent.policy_samples": (2, math.inf),
+  "agent.image_shift": (0, 16),
+  # A third of an episode of 14 s; a batch holds this many times the images.
+  "agent.lstm_instants": (0, 32),
+  "agent.color_jitter": (0, 1),
+  "replay.expert_share": (0, 1),
+}
+_MAX_SIDE = 1024  # pixels
+
+_OTHER_BYTES = 4 * (21 + 3 + 7 + 21 + 2) + 2
+"""Bytes of a slot without images: robot state, tool, action, primitive labels, reward
+and log density of the action (f32), and the two end flags."""
+
+
+def validate(
+  config: TrainConfig,
+  *,
+  tasks: Sequence[str] | None = None,
+  algorithms: Mapping[str, Sequence[str]] | None = None,
+  memory_bytes: int | None = None,
+  devices: int = 1,
+) -> None:
+  """Checks that a configuration can work.
+
+  Args:
+    config: Configuration to check.
+    tasks: Valid task names; not checked if None.
+    algorithms: Valid algorithm names, each with the agent settings (numbers of
+      candidates) whose logarithm bounds epsilon; not checked if None.
+    memory_bytes: Memory of one device, which the replays must fit into; not checked if
+      None.
+    devices: Number of devices that share the worlds and batches.
+
+  Raises:
+    ConfigError: A setting is invalid. The one-line message names it and the valid
+      choices or the fix.
+  """
+  _check_values(dict(codec.flatten(config)))
+  if tasks is not None:
+    check_name("env.task", config.env.task, tasks)
+  if algorithms is not None:
+    check_name("agent.algorithm", config.agent.algorithm, tuple(algorithms))
+  _check_env(config.env)
+  _check_agent(config.agent)
+  if algorithms is not None and config.agent.temperature != "fixed":
+    _check_epsilon(config.agent, algorithms[config.agent.algorithm])
+  _check_expert(config)
+  _check_replay(config, None if memory_bytes is None else memory_bytes * devices)
+  for name, number in (
+    ("env.worlds", config.env.worlds),
+    ("replay.batch_size", config.replay.batch_size),
+  ):
+    if number % devices:
+      raise ConfigError(f"{name}={number} must be a multiple of the {devices} devices")
+
+
+def replay_bytes(config: TrainConfig) -> int:
+  """Returns an upper bound on the bytes of both replays, without object points."""
+  images = math.prod(config.env.global_size) + math.prod(config.env.wrist_size)
+  slot = _OTHER_BYTES + (3 * images if config.env.obs == "pixels" else 0)
+  return slot * (config.replay.capacity + config.replay.expert_steps)
+
+
+def _check_values(values: Mapping[str, Any]) -> None:
+  """Checks each setting by itself; ``values`` maps dotted names to values."""
+  for name, value in values.items():
+    if isinstance(value, float) and not math.isfinite(value):
+      raise ConfigError(f"{name}={value} is not a finite number")
+    if isinstance(value, int) and value >= 2**31:
+      raise ConfigError(f"{name}={value} must be below 2**31")
+  for name in _POSITIVE:
+    if values[name] <= 0:
+      raise ConfigError(f"{name}={values[name]} must be positive")
+  for name in _NOT_NEGATIVE:
+    if values[name] < 0:
+      raise ConfigError(f"{name}={values[name]} must not be negative")
+  for name, (low, high) in _BOUNDS.items():
+    if values[name] < low:
+      raise ConfigError(f"{name}={values[name]} must be at least {low}")
+    if values[name] > high:
+      raise ConfigError(f"{name}={values[name]} must be at most {high}")
+  for name, choices in _CHOICES.items():
+    check_name(name, values[name], choices)
+
+
+def _check_env(env: EnvConfig) -> None:
+  if env.episode_steps < 1:
+    raise ConfigError(
+      f"env.time_limit_s={env.time_limit_s} is shorter than one control period; use at "
+      f"least {env.control_period_s}"
+    )
+  for name in ("global_size", "wrist_size"):
+    size = getattr(env, name)
+    if len(size) != 2 or min(size) < 1 or max(size) > _MAX_SIDE:
+      raise ConfigError(
+        f"env.{name}={size} must be height and width, each from 1 to {_MAX_SIDE} pixels"
+      )
+  validate_ranges(env.randomization, "env.randomization.")
+  delay = env.randomization.delay_s
+  if env.randomize and delay >= env.control_period_s:
+    raise ConfigError(
+      f"env.randomization.delay_s={delay} must be below env.control_period_s="
+      f"{env.control_period_s}: a command must take effect before the next one"
+    )
+
+
+def _check_agent(agent: AgentConfig) -> None:
+  for name in ("gamma", "target_rate"):
+    if not 0.0 < getattr(agent, name) <= 1.0:
+      raise ConfigError(f"agent.{name}={getattr(agent, name)} must be within (0, 1]")
+  if not agent.hidden or min(agent.hidden) < 1 or max(agent.hidden) >= 2**31:
+    raise ConfigError(f"agent.hidden={agent.hidden} must be positive layer widths")
+  if not 0.0 < agent.min_prob < 1.0 / 3.0:
+    raise ConfigError(f"agent.min_prob={agent.min_prob} must be within (0, 1/3)")
+  if not 0.0 < agent.policy_min_prob < 0.5:
+    raise ConfigError(
+      f"agent.policy_min_prob={agent.policy_min_prob} must be within (0, 1/2)"
+    )
+  if agent.v_min >= agent.v_max:
+    raise ConfigError(
+      f"agent.v_min={agent.v_min} must be below agent.v_max={agent.v_max}"
+    )
+  for low, start, high in (
+    ("min_std", "initial_std", "max_std"),
+    ("policy_min_std", "policy_initial_std", "policy_max_std"),
+    ("v_min", "initial_value", "v_max"),
+  ):
+    if not getattr(agent, low) < getattr(agent, start) < getattr(agent, high):
+      raise ConfigError(
+        f"agent.{start}={getattr(agent, start)} must lie between agent.{low}="
+        f"{getattr(agent, low)} and agent.{high}={getattr(agent, high)}"
+      )
+
+
+def _check_epsilon(agent: AgentConfig, bounds: Sequence[str]) -> None:
+  # The KL of a distribution over S samples from their uniform weights is at most
+  # log S. A larger limit never binds, and the temperature would run to zero.
+  for name in bounds:
+    samples = getattr(agent, name)
+    if agent.epsilon >= math.log(samples):
+      raise ConfigError(
+        f"agent.epsilon={agent.epsilon} can never bind: it must be below log({samples})"
+        f" = {math.log(samples):.3f}; lower it, or raise agent.{name}"
+      )
+
+
+def _check_expert(config: TrainConfig) -> None:
+  replay = config.replay
+  expert = replay.batch_size * replay.expert_share
+  if abs(expert - round(expert)) > 1e-6:
+    raise ConfigError(
+      f"replay.batch_size={replay.batch_size} times replay.expert_share="
+      f"{replay.expert_share} is not whole; use expert_share="
+      f"{round(expert) / replay.batch_size:.6g}"
+    )
+  if replay.expert_steps % config.env.worlds:
+    raise ConfigError(
+      f"replay.expert_steps={replay.expert_steps} must be a multiple of env.worlds="
+      f"{config.env.worlds}"
+    )
+  if expert and not replay.expert_steps:
+    raise ConfigError(
+      "replay.expert_steps=0 leaves nothing to draw; use replay.expert_share=0"
+    )
+  if replay.demonstrations and not replay.expert_steps:
+    raise ConfigError(
+      "replay.expert_steps=0 leaves no room for replay.demonstrations="
+      f"{replay.demonstrations}"
+    )
+  if replay.demonstrations and config.env.randomize:
+    raise ConfigError(
+      f"replay.demonstrations={replay.demonstrations} cannot be used with "
+      "env.randomize: they show the world of the scene file"
+    )
+
+
+def _check_replay(config: TrainConfig, memory_bytes: int | None) -> None:
+  capacity = config.replay.capacity
+  per_iteration = config.env.worlds * config.rollout_length
+  if capacity % per_iteration:
+    raise ConfigError(
+      f"replay.capacity={capacity} must be a multiple of env.worlds * rollout_length = "
+      f"{per_iteration}; use {max(1, round(capacity / per_iteration)) * per_iteration}"
+    )
+  fewest = config.agent.n_step + 2 + max(config.agent.lstm_instants - 1, 0)
+  if capacity // config.env.worlds < fewest:
+    raise ConfigError(
+      f"replay.capacity={capacity} holds no {config.agent.n_step}-step transition; use "
+      f"at least {fewest * config.env.worlds}"
+    )
+  need = replay_bytes(config)
+  if memory_bytes is not None and need > memory_bytes:
+    raise ConfigError(
+      f"the replays need {need / 2**30:.1f} GiB but the devices have "
+      f"{memory_bytes / 2**30:.1f} GiB; lower replay.capacity or replay.expert_steps"
+    )

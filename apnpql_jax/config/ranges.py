@@ -1,0 +1,108 @@
+"""Ranges of domain randomization (paper Sec. V-C) and their limits.
+
+Part of the configuration; ``randomization`` draws within them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+from apnpql_jax.config import codec
+from apnpql_jax.errors import ConfigError
+
+_MAX_RELATIVE = 0.5
+"""Upper limit of the ranges not listed below, as a fraction of the nominal value."""
+
+_MAX_ABSOLUTE = {
+  "color": 1.0,
+  "texture": 1.0,
+  "light_turn": 0.9,
+  "camera_shift": 0.2,
+  "camera_turn": 0.3,
+  "table_height": 0.1,
+  "table_tilt": 0.1,
+  "size": 0.1,
+  "shape": 0.1,
+  "damping": 2.0,
+  "delay_s": 1.0,
+}
+"""Upper limits in the units of the settings. Objects of larger variation in size or
+shape fit neither the hand nor the places they are put into."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RandomizationConfig:
+  """Largest deviation of each property from the scene file (paper Sec. V-C).
+
+  Takes effect with ``randomize``. Deviations are uniform, drawn per world and episode.
+  Relative ranges are fractions of the nominal value; 0 switches a property off.
+  """
+
+  color: float = 0.15
+  """RGB of robot, table, background and each object, on a scale of 0 to 1."""
+
+  texture: float = 0.2
+  """Largest color change by checkers and noise on robot, table, background and each
+  object, on a scale of 0 to 1. A third each are plain, checkered and noisy."""
+
+  light_turn: float = 0.4
+  """Direction of the light: each component of its unit vector."""
+
+  light_level: float = 0.3
+  """Ambient and direct light, relative."""
+
+  camera_shift: float = 0.02
+  """Position of the global camera along each axis in m; the wrist camera moves a tenth
+  of this."""
+
+  camera_turn: float = 0.02
+  """Orientation of the cameras about each axis in rad."""
+
+  field_of_view: float = 0.03
+  """Field of view of the cameras, relative."""
+
+  table_height: float = 0.015
+  """Height of the table below the robot in m."""
+
+  table_tilt: float = 0.01
+  """Tilt of the table against the robot's base about both horizontal axes in rad."""
+
+  table_turn: float = 0.05
+  """Rotation of the table and everything on it about the robot's vertical axis in
+  rad."""
+
+  size: float = 0.05
+  """Size of each object, relative."""
+
+  shape: float = codec.added(0.04, before=0.0)
+  """Ratio of height to width of each object, relative. flip_cup always draws one of
+  three cup shapes."""
+
+  mass: float = 0.3
+  """Mass of each object, relative."""
+
+  friction: float = 0.2
+  """One factor on the friction of all contacts, relative."""
+
+  damping: float = 0.2
+  """Joint damping added to the robot's in 1/s (torque per velocity and joint inertia),
+  drawn from 0 to this."""
+
+  delay_s: float = 0.03
+  """Delay from a command to its effect in seconds, drawn from 0 to this."""
+
+  gripper_speed: float = 0.2
+  """Speed of the gripper, relative."""
+
+
+def validate_ranges(ranges: RandomizationConfig, prefix: str) -> None:
+  """Checks that every range is within its limits.
+
+  Raises:
+    ConfigError: A range is negative or too large; the message prepends ``prefix`` to
+      its name.
+  """
+  for name, value in codec.flatten(ranges):
+    limit = _MAX_ABSOLUTE.get(name, _MAX_RELATIVE)
+    if not 0.0 <= value <= limit:
+      raise ConfigError(f"{prefix}{name}={value} must be within [0, {limit}]")

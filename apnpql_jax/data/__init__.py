@@ -1,0 +1,1 @@
+"""Transitions and demonstrations, in memory and on disk."""

@@ -1,0 +1,59 @@
+"""Reads ``.npz`` files that other people made: arrays only, sizes before memory."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+import tokenize
+import zipfile
+import zlib
+
+import numpy as np
+
+from apnpql_jax.errors import FileError, UserError, one_line
+
+_ERRORS = (OSError, ValueError, EOFError, KeyError, RuntimeError, MemoryError)
+_ERRORS += (NotImplementedError, zipfile.BadZipFile, zlib.error)
+_ERRORS += (LookupError, SyntaxError, TypeError, tokenize.TokenError)
+"""What zipfile and NumPy raise at archives that are none."""
+
+
+def read(path: Path, *, limit: int) -> dict[str, np.ndarray]:
+  """All arrays of an archive; nothing in it is executed.
+
+  Args:
+    path: the file.
+    limit: bytes that all arrays together may take.
+
+  Raises:
+    FileError: it is no archive of arrays, is damaged, holds Python objects, or takes
+      more than ``limit``.
+  """
+  try:
+    with zipfile.ZipFile(path) as archive:
+      names = archive.namelist()
+      size = sum(_nbytes(archive, name) for name in names)
+      if size > limit:
+        raise FileError(f"{path} takes {size} bytes, more than {limit}")
+      return {name.removesuffix(".npy"): _array(archive, name) for name in names}
+  except UserError:
+    raise
+  except _ERRORS as error:
+    raise FileError(f"{path} is no archive of arrays: {one_line(error)}") from None
+
+
+def _nbytes(archive: zipfile.ZipFile, name: str) -> int:
+  """What the header of an array asks for."""
+  with archive.open(name) as file:
+    version = np.lib.format.read_magic(file)
+    if version != (1, 0):
+      raise ValueError(f"{name}: unknown version {version}")
+    shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+  if dtype.hasobject or any(n < 0 for n in shape):
+    raise ValueError(f"{name}: {dtype}{list(shape)} is no plain array")
+  return math.prod(shape) * dtype.itemsize
+
+
+def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+  with archive.open(name) as file:
+    return np.lib.format.read_array(file, allow_pickle=False)

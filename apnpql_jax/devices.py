@@ -1,0 +1,172 @@
+"""Several devices and processes: worlds and batches are split, all else is replicated.
+
+The iteration stays one program for all worlds, which XLA partitions along its arrays:
+random numbers equal those of one device, and results do within rounding. Module
+``placement`` says which part of the state is split. Processes on several hosts share
+one run: each computes for its own devices, and the first one writes and prints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import itertools
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, PartitionSpec
+import numpy as np
+
+from apnpql_jax.errors import ConfigError, one_line
+
+AXIS = "worlds"
+"""The only axis of the mesh; batches are split along it too."""
+
+_MEMINFO = Path("/proc/meminfo")
+_CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
+_BARRIER_TIMEOUT_MS = 3_600_000
+_barriers = itertools.count()
+
+
+def join(coordinator: str, processes: int | None, process: int | None) -> None:
+  """Joins the processes of a run; must precede the start of JAX's backend.
+
+  Args:
+    coordinator: Address and port of the first process; "auto" to get all three values
+      from the batch system.
+    processes: Number of processes that share the run.
+    process: Index of this process, from 0.
+
+  Raises:
+    ConfigError: The processes cannot connect.
+  """
+  # The run handles signals itself; JAX would take over SIGTERM.
+  jax.config.update("jax_enable_preemption_service", False)
+  address = None if coordinator == "auto" else coordinator
+  try:
+    jax.distributed.initialize(address, processes, process)
+  except (RuntimeError, TypeError, ValueError) as error:
+    raise ConfigError(f"--coordinator {coordinator}: {one_line(error)}") from None
+
+
+def make_mesh(devices: int) -> Mesh | None:
+  """Returns a one-dimensional mesh of the first devices, or None for a single one.
+
+  Args:
+    devices: Number of devices; 0 for all devices of all processes.
+
+  Raises:
+    ConfigError: There are fewer devices.
+  """
+  found = jax.devices()
+  if not 0 <= devices <= len(found):
+    raise ConfigError(f"--devices {devices} must be within 0 (all) and {len(found)}")
+  chosen = found[: devices or None]
+  return Mesh(np.array(chosen), (AXIS,)) if len(chosen) > 1 else None
+
+
+def per_device(function: Callable[..., Any], mesh: Mesh | None) -> Callable[..., Any]:
+  """Returns a function of arrays [worlds, ...] that each device runs on its own worlds.
+
+  For computations without interaction between worlds. XLA can partition these too, but
+  not host calls, and a loop would run on all devices until the last world is done, with
+  a message between devices in every iteration.
+  """
+  if mesh is None:
+    return function
+  spec = PartitionSpec(AXIS)
+  return jax.shard_map(
+    function, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
+  )
+
+
+def local(tree: Any) -> Any:
+  """Returns replicated arrays as arrays on the first device of this process."""
+  return jax.tree.map(lambda x: x.addressable_data(0), tree)
+
+
+def is_primary() -> bool:
+  """Returns whether this is the first process, which writes and prints."""
+  return jax.process_index() == 0
+
+
+def run_on_primary(function: Callable[[], Any]) -> None:
+  """Calls a function in the first process; the others wait until it returns."""
+  if is_primary():
+    function()
+  barrier()
+
+
+def any_process(flag: object) -> bool:
+  """Returns in every process whether the flag is true in any of them."""
+  barrier()
+  return bool(multihost_utils.process_allgather(np.array(bool(flag))).any())
+
+
+def barrier() -> None:
+  """Waits until all processes have called this.
+
+  Inside a compiled program CPUs wait at most 30 seconds for each other, so whatever
+  takes processes different times must be followed by a barrier.
+  """
+  if jax.process_count() == 1:
+    return
+  from orbax.checkpoint import multihost
+
+  wait = multihost.get_barrier_sync_fn()
+  wait(key=f"apnpql_{next(_barriers)}", timeout_ms=_BARRIER_TIMEOUT_MS)
+
+
+def check_memory(needed: int, what: str, available: int | None = None) -> None:
+  """Checks that something fits into memory before it is allocated.
+
+  Args:
+    needed: Size in bytes.
+    what: Name of the thing in the message.
+    available: Free bytes; those of the device if None.
+
+  Raises:
+    ConfigError: ``needed`` exceeds the free memory.
+  """
+  free = available_memory() if available is None else available
+  if free is not None and needed > free:
+    raise ConfigError(
+      f"{what} needs {needed / 2**30:.2f} GiB but {free / 2**30:.2f} GiB of memory "
+      "are available; lower replay.capacity or replay.expert_steps"
+    )
+
+
+def available_memory() -> int | None:
+  """Returns the free bytes per device, a share of RAM for CPUs; None if unknown."""
+  stats = jax.local_devices()[0].memory_stats() or {}
+  if "bytes_limit" in stats:
+    return stats["bytes_limit"] - stats.get("bytes_in_use", 0)
+  host = host_memory()
+  return None if host is None else host // jax.local_device_count()
+
+
+def host_memory() -> int | None:
+  """Returns the bytes of RAM that this process may still use; None if unknown."""
+  bounds = [b for b in (_free_memory(), _container_limit()) if b is not None]
+  return min(bounds, default=None)
+
+
+def _free_memory() -> int | None:
+  try:
+    lines = dict(x.split(":", 1) for x in _MEMINFO.read_text().splitlines())
+    return int(lines["MemAvailable"].split()[0]) * 1024
+  except (OSError, KeyError, ValueError):
+    pass
+  try:  # Outside Linux: total memory, free or not.
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+  except (AttributeError, OSError, ValueError):
+    return None
+
+
+def _container_limit() -> int | None:
+  try:
+    return int(_CGROUP_LIMIT.read_text())
+  except (OSError, ValueError):  # No limit, or "max".
+    return None

@@ -1,0 +1,1 @@
+"""Batches of worlds: states, cameras, reset and step."""

@@ -1,0 +1,83 @@
+"""The cameras of a scene as functions from poses to images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from apnpql_jax.config.schema import EnvConfig
+from apnpql_jax.render import CameraSpec, Geoms, Lighting, render
+from apnpql_jax.render.shadow import SHADOWS
+from apnpql_jax.sim.kinematics import Kinematics
+from apnpql_jax.sim.scene import Scene
+from apnpql_jax.types import Array
+
+FLAT = 0.002
+"""m; thinner geoms are flat marks on the table, which receive shadows as it does."""
+
+Renderer = Callable[[Kinematics], Array]
+
+
+def make_cameras(config: EnvConfig, scene: Scene) -> tuple[Renderer, Renderer]:
+  """Returns the cameras of the agent: the global one and the one on the wrist.
+
+  Raises:
+    ConfigError: the scene cannot be drawn.
+  """
+  return (
+    camera_renderer(config, scene, "global", config.global_size),
+    camera_renderer(config, scene, "wrist", config.wrist_size),
+  )
+
+
+def camera_renderer(
+  config: EnvConfig, scene: Scene, name: str, size: tuple[int, int]
+) -> Renderer:
+  """Returns ``f(kinematics) -> u8[*b, H, W, 3]`` for a camera of the scene."""
+  index = scene.id("camera", name)
+  height, width = size
+  spec = CameraSpec.from_model(scene.model, name, height=height, width=width)
+  geoms = Geoms.from_model(scene.model)
+  shadows = shadows_of_the_hand(scene, geoms) if config.shadows else {}
+  lighting = Lighting.from_model(scene.model, **shadows)
+
+  def renderer(kinematics: Kinematics) -> Array:
+    return render(
+      geoms,
+      spec,
+      kinematics.geom_xpos,
+      kinematics.geom_xmat,
+      kinematics.cam_xpos[..., index, :],
+      kinematics.cam_xmat[..., index, :, :],
+      lighting,
+      fields=kinematics.fields,
+      outputs=("rgb",),
+    ).rgb
+
+  return renderer
+
+
+def shadows_of_the_hand(scene: Scene, geoms: Geoms) -> dict[str, Any]:
+  """Returns the ``Lighting`` settings for the hand's shadow on table and flat marks."""
+  model, hand = scene.model, scene.id("body", "gripper")
+  in_hand = np.zeros(model.nbody, bool)
+  for body in range(hand, model.nbody):  # Parents have lower ids.
+    in_hand[body] = body == hand or in_hand[model.body_parentid[body]]
+  body, kind = model.geom_bodyid[geoms.ids], geoms.types
+  casts = in_hand[body] & np.isin(kind, list(SHADOWS))
+  # What cannot move by itself, and is flat, receives the shadow.
+  still = (model.body_rootid[body] == 0) | (model.body_mocapid[body] >= 0)
+  shapes = mujoco.mjtGeom
+  half_height = np.select(
+    [kind == shapes.mjGEOM_BOX, kind == shapes.mjGEOM_CYLINDER],
+    [geoms.sizes[:, 2], geoms.sizes[:, 1]],
+    np.where(kind == shapes.mjGEOM_PLANE, 0.0, np.inf),
+  )
+  receives = still & (2 * half_height < FLAT)
+  return {
+    "shadow_casters": tuple(geoms.ids[casts].tolist()),
+    "shadow_receivers": tuple(geoms.ids[receives].tolist()),
+  }

@@ -1,0 +1,57 @@
+"""The cost of a task's contacts: pairs, slots, constraint rows, steps per second."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import time
+
+import jax
+import jax.numpy as jnp
+from mujoco import mjx
+import numpy as np
+
+from apnpql_jax.sim import engines, physics
+from apnpql_jax.tasks import Task
+
+WORLDS = 64
+SUBSTEPS = 30
+"""Physics steps per timed call: one control period of 0.15 s at 5 ms."""
+
+REPEATS = 3
+"""Timed calls, after one that compiles; the fastest counts."""
+
+
+def contact_report(
+  task: Task, *, backends: Sequence[str] = ("native", "mjx")
+) -> dict[str, float]:
+  """Measures a task's scene on this machine, with the arm at rest.
+
+  Args:
+    task: the task.
+    backends: engines to time.
+
+  Returns:
+    ``pairs``; ``contacts`` and ``constraint_rows``, the slots that MJX computes at
+    every substep whether anything touches or not; ``native_steps_per_s`` and
+    ``mjx_steps_per_s``, physics steps summed over worlds.
+  """
+  scene = task.scene
+  slots = mjx.make_data(scene.model, impl="jax")._impl
+  report = {
+    "pairs": scene.model.npair,
+    "contacts": slots.ncon,
+    "constraint_rows": int(slots.nefc),
+  }
+  draw = task.sample_resets(np.random.default_rng(0), WORLDS)
+  start = physics.initial_state(scene, *map(jnp.asarray, draw))
+  still, close = jnp.zeros((WORLDS, 6)), jnp.zeros(WORLDS)
+  for name in backends:
+    step = jax.jit(engines.make_physics(name, scene, substeps=SUBSTEPS).step)
+    state = jax.block_until_ready(step(start, still, close))
+    fastest = float("inf")
+    for _ in range(REPEATS):
+      began = time.perf_counter()
+      state = jax.block_until_ready(step(state, still, close))
+      fastest = min(fastest, time.perf_counter() - began)
+    report[f"{name}_steps_per_s"] = WORLDS * SUBSTEPS / fastest
+  return report

@@ -1,0 +1,285 @@
+"""A batch of worlds of one task: reset, step, observe.
+
+All functions are pure over ``EnvState`` and can run inside jit; the world axis comes
+first. A step from a terminal instant ignores the action and resets that world to a
+random row of the bank, so that terminal observations reach the replay. A world whose
+state is not finite is reset in the same way, and counted.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+from jaxtyping import Bool, Float, Int, PRNGKeyArray, UInt8
+
+from apnpql_jax import devices
+from apnpql_jax.config.schema import EnvConfig
+from apnpql_jax.envs.cameras import Renderer, make_cameras
+from apnpql_jax.envs.state import Arrival, EnvState, where_world
+from apnpql_jax.errors import ConfigError
+from apnpql_jax.primitives import tracking
+from apnpql_jax.primitives.reset_bank import ResetBank, load_bank
+from apnpql_jax.randomization.randomize import make_randomize
+from apnpql_jax.sim import arm, engines, physics
+from apnpql_jax.sim.kinematics import Kinematics, make_kinematics
+from apnpql_jax.sim.physics import PhysicsState
+from apnpql_jax.sim.scene import Scene
+from apnpql_jax.tasks import Task, make_task
+from apnpql_jax.types import Array, Observation, TimeStep
+
+HISTORY = 3
+"""Robot states stacked in an observation (paper Sec. V-A)."""
+
+HELD_OUT_SHARE = 0.25
+"""Share of the bank's rows that is reserved for evaluation."""
+
+
+class Env:
+  """The worlds of one task. It holds constants only, its state is an ``EnvState``.
+
+  ``reset`` and ``step`` consist of two halves each:
+
+      reset:  rows ------- begin ----> Arrival -- observe --> EnvState
+      step:   EnvState -- advance ---> Arrival -- observe --> EnvState
+
+  Most of a compiled program is ``observe``. A loop that begins with it, and carries an
+  ``Arrival``, contains it once. States from elsewhere are observed through
+  ``Arrival.after``.
+  """
+
+  def __init__(
+    self,
+    config: EnvConfig,
+    task: Task,
+    bank: ResetBank,
+    mesh: Mesh | None = None,
+    *,
+    instants: int = 0,
+  ):
+    """Builds the engine, the cameras and the randomization.
+
+    Args:
+      config: sizes, limits, engine and kind of observation.
+      task: the task.
+      bank: reset states of the task.
+      mesh: devices to split the worlds between; one device if None.
+      instants: L, the length of ``EnvState.recent``; 0 for none.
+    """
+    scene = task.scene
+    self.config, self.task, self.mesh = config, task, mesh
+    self.physics = engines.make_physics(
+      config.backend, scene, substeps=_substeps(config, scene)
+    )
+    self._bank, self._instants = bank, instants
+    self._chain = arm.make_chain(scene)
+    self._kinematics = make_kinematics(scene)
+    self._cameras = make_cameras(config, scene)
+    # Traced once per number of worlds; compiled when called outside jit.
+    self._observe = devices.per_device(jax.jit(self._judge_and_observe), mesh)
+    self._reset = jax.jit(lambda rows: self.observe(self.begin(rows)))
+    self._randomize = (
+      make_randomize(config.randomization, scene) if config.randomize else None
+    )
+
+  def on_one_device(self) -> Env:
+    """Returns the same worlds without a mesh, for evaluations and videos."""
+    if self.mesh is None:
+      return self
+    return Env(self.config, self.task, self._bank, instants=self._instants)
+
+  @property
+  def bank_split(self) -> int:
+    """The first of the bank's rows that are held out for evaluation."""
+    return int(self._bank.rows * (1 - HELD_OUT_SHARE))
+
+  @property
+  def held_out(self) -> int:
+    """Number of held-out rows."""
+    return self._bank.rows - self.bank_split
+
+  def reset(self, rows: Int[Array, " worlds"]) -> EnvState:
+    """Starts one world per bank row; a row always has the same randomization."""
+    return self._reset(rows)
+
+  def step(
+    self, state: EnvState, action: Float[Array, "worlds 7"], key: PRNGKeyArray
+  ) -> EnvState:
+    """Runs one control period in every world; see ``advance``."""
+    return self.observe(self.advance(state, action, key))
+
+  def begin(self, rows: Int[Array, " worlds"]) -> Arrival:
+    """Starts one world per bank row: first half of ``reset``."""
+    count = rows.shape[0]
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), rows)
+    first = Arrival(
+      physics=self._initial(rows, keys),
+      targets=self._bank.targets[rows],
+      elapsed=jnp.zeros(count, jnp.int32),
+      fresh=jnp.ones(count, bool),
+      history=jnp.zeros((count, HISTORY * 7)),
+      faults=jnp.zeros(count, jnp.int32),
+      recent=None,
+    )
+    if not self._instants:
+      return first
+    # Only shapes matter: ``observe`` overwrites the values where an episode begins.
+    shapes = jax.eval_shape(self._observe, first).timestep.observation
+    empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    return first.replace(recent=jax.tree.map(self._repeated, empty))
+
+  def advance(
+    self, state: EnvState, action: Float[Array, "worlds 7"], key: PRNGKeyArray
+  ) -> Arrival:
+    """Runs the physics of one control period: first half of ``step``.
+
+    Args:
+      state: the worlds.
+      action: see ``types.ACTION_DIM``.
+      key: draws the bank rows of worlds that are reset.
+    """
+    physics_step = devices.per_device(self.physics.step, self.mesh)
+    moved = physics_step(state.physics, action[:, :6], action[:, 6])
+    # Reset worlds whose episode is over or whose state is broken.
+    broken = ~state.timestep.last & ~self._sound(state, action, moved)
+    reset = state.timestep.last | broken
+    rows = jax.random.randint(key, reset.shape, 0, self.bank_split)
+    keys = jax.random.split(jax.random.fold_in(key, 1), len(rows))
+    initial = self._initial(rows, keys)
+    merged = jax.tree.map(functools.partial(where_world, reset), initial, moved)
+    arrival = Arrival.after(state, merged, self._bank.targets[rows], reset)
+    return arrival.replace(faults=state.faults + broken)
+
+  def observe(self, arrival: Arrival) -> EnvState:
+    """Rewards, labels and observes an instant: second half of both."""
+    state = self._observe(arrival.replace(recent=None))
+    if arrival.recent is None:
+      return state
+
+    def push(recent: Array, new: Array) -> Array:
+      recent = where_world(arrival.fresh, self._repeated(new), recent)
+      return jnp.concatenate([recent[:, 1:], new[:, None]], axis=1)
+
+    recent = jax.tree.map(push, arrival.recent, state.timestep.observation)
+    return state.replace(recent=recent)
+
+  def tool_targets(self, state: PhysicsState) -> tuple[Array, Array, Array]:
+    """Returns ``Task.tool_targets`` of the worlds."""
+    return self.task.tool_targets(state, self._kinematics(state))
+
+  def variant(self, rows: Int[Array, " worlds"]) -> Int[Array, " worlds"]:
+    """Returns the variants of the scene at rows of the bank."""
+    return self._bank.variant[rows]
+
+  def expert_action(self, state: EnvState) -> Float[Array, "worlds 7"]:
+    """Returns the actions of the task's scripted expert."""
+    kinematics = self._kinematics(state.physics)
+    return self.task.expert(state.physics, kinematics, state.timestep.primitives)
+
+  def view(
+    self, renderer: Renderer, state: PhysicsState
+  ) -> UInt8[Array, "worlds H W 3"]:
+    """Renders the worlds through another camera, for videos."""
+    return renderer(self._kinematics(state))
+
+  def _repeated(self, x: Array) -> Array:
+    """Repeats L times, [worlds, ...] -> [worlds, L, ...]."""
+    return jnp.repeat(x[:, None], self._instants, axis=1)
+
+  def _initial(self, rows: Array, keys: Array) -> PhysicsState:
+    """Returns worlds at rest at rows of the bank, randomized if configured."""
+    bank = self._bank
+    state = physics.initial_state(
+      self.task.scene,
+      bank.qpos[rows],
+      bank.mocap_pos[rows],
+      bank.mocap_quat[rows],
+      bank.variant[rows],
+    )
+    return state if self._randomize is None else self._randomize(state, keys)
+
+  def _sound(
+    self, before: EnvState, action: Array, moved: PhysicsState
+  ) -> Bool[Array, " worlds"]:
+    """Checks that all values are finite and that the engine has not reset the world.
+
+    C MuJoCo silently puts a world that is not finite back to its default pose; its
+    clock then shows less than before.
+    """
+    leaves = jax.tree.leaves((before.physics, before.targets, action, moved))
+    finite = [jnp.isfinite(x).all(tuple(range(1, x.ndim))) for x in leaves]
+    return jnp.stack(finite).all(0) & (moved.time > before.physics.time)
+
+  def _judge_and_observe(self, arrival: Arrival) -> EnvState:
+    """Computes all of ``observe`` except the last L observations."""
+    state, fresh = arrival.physics, arrival.fresh
+    kinematics = self._kinematics(state)
+    # Move the joint targets of the primitives to where the tool should be now.
+    *pose, close = self.task.tool_targets(state, kinematics)
+    q = state.qpos[:, self.task.scene.arm_qpos]
+    present = jnp.broadcast_to(q[:, None], arrival.targets.shape)
+    chain = arm.with_base(self._chain, self.task.scene, state.fields)
+    targets = tracking.refine(chain, arrival.targets, present, *pose)
+    # An episode cannot end at its first instant.
+    solved = self.task.success(state, kinematics) & ~fresh
+    late = (arrival.elapsed >= self.config.episode_steps) & ~fresh
+    timestep = TimeStep(
+      observation=self._observation(state, kinematics, fresh, arrival.history),
+      reward=solved.astype(jnp.float32),
+      terminated=solved,
+      truncated=late & ~solved,
+      primitives=jnp.concatenate(
+        [tracking.follow(targets, q[:, None]), close[..., None]], axis=-1
+      ),
+    )
+    return EnvState(state, targets, arrival.elapsed, timestep, arrival.faults)
+
+  def _observation(
+    self, state: PhysicsState, kinematics: Kinematics, fresh: Array, history: Array
+  ) -> Observation:
+    scene = self.task.scene
+    joints = state.qpos[:, jnp.append(scene.arm_qpos, scene.gripper_qpos)]
+    stacked = jnp.concatenate([history[:, 7:], joints], axis=-1)
+    robot = where_world(fresh, jnp.tile(joints, (1, HISTORY)), stacked)
+    tool = kinematics.site_xpos[:, scene.tool_site]
+    if "body_pos" in state.fields or "body_quat" in state.fields:
+      # The robot's own estimate, which does not include how the table stands.
+      tool, _, _ = arm.forward(self._chain, state.qpos[:, scene.arm_qpos])
+    observation = Observation(robot=robot, tool=tool)
+    if self.config.obs == "state":
+      return observation.replace(objects=self.task.objects(state))
+    overview, wrist = (camera(kinematics) for camera in self._cameras)
+    return observation.replace(global_image=overview, wrist_image=wrist)
+
+
+def make_env(config: EnvConfig, mesh: Mesh | None = None, *, instants: int = 0) -> Env:
+  """Builds the worlds of ``config.task``, and its reset bank on first use.
+
+  Args:
+    config: see ``Env``.
+    mesh: see ``Env``.
+    instants: see ``Env``; ``agent.lstm_instants`` of the agent that acts in it.
+
+  Raises:
+    ConfigError: unknown task or engine, a scene that cannot be simulated or drawn, a
+      control period that is not a multiple of the timestep, or too few usable resets.
+  """
+  task = make_task(config.task)
+  # Fail on a scene that cannot be drawn before building the bank.
+  make_cameras(config, task.scene)
+  bank, _ = load_bank(task, config.bank_rows)
+  return Env(config, task, bank, mesh, instants=instants)
+
+
+def _substeps(config: EnvConfig, scene: Scene) -> int:
+  """Returns the number of physics steps per control period."""
+  timestep = scene.model.opt.timestep
+  substeps = round(config.control_period_s / timestep)
+  if substeps < 1 or abs(substeps * timestep - config.control_period_s) > 1e-9:
+    raise ConfigError(
+      f"env.control_period_s={config.control_period_s} must be a multiple of the "
+      f"scene's timestep, {timestep} s"
+    )
+  return substeps

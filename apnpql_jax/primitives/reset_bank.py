@@ -1,0 +1,220 @@
+"""Reset states with the joint targets of their primitives, built once per task.
+
+Inside jit a reset only gathers a random row, so random resets cost nothing on any
+backend.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import concurrent.futures
+import dataclasses
+import functools
+import hashlib
+import inspect
+import json
+import multiprocessing
+import os
+import pathlib
+import tempfile
+import time
+from typing import Any
+
+from flax import struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+
+from apnpql_jax.errors import ConfigError
+from apnpql_jax.primitives import ik
+from apnpql_jax.runtime import cache_dir, cores
+from apnpql_jax.sim import physics
+from apnpql_jax.sim.kinematics import make_kinematics
+from apnpql_jax.sim.native import NativePhysics
+from apnpql_jax.sim.scene import free_joints
+from apnpql_jax.tasks.task import Task
+from apnpql_jax.types import Array
+
+VERSION = 3
+"""Part of the cache key; increased when the meaning of a bank changes."""
+
+SEED = 0
+CHUNK = 32
+MAX_DRAWS = 20
+"""Draws per row before the task is rejected for lack of usable resets."""
+SETTLE_PERIODS = 4
+"""Control periods of 0.15 s at rest before a draw is accepted."""
+SETTLE_SPEED = 0.05
+"""m/s and rad/s; above float32 contact noise (0.04)."""
+SETTLE_SHIFT = 0.005
+"""m; an object that moves further while it settles overlapped with another."""
+
+MAX_TRAVEL = 2.5
+"""rad; a joint that turns further would pass through another branch of the arm's
+configurations."""
+
+
+class ResetBank(struct.PyTreeNode):
+  """Settled initial states and the joint targets of their primitives."""
+
+  qpos: Array  # f32[rows, nq]
+  mocap_pos: Array  # f32[rows, nmocap, 3]
+  mocap_quat: Array  # f32[rows, nmocap, 4]
+  variant: Array  # i32[rows]: variant of the scene
+  targets: Array  # f32[rows, 3, 6], rad
+
+  @property
+  def rows(self) -> int:
+    """Returns the number of reset states."""
+    return self.qpos.shape[0]
+
+
+@dataclasses.dataclass
+class BankReport:
+  """Statistics of building a bank."""
+
+  drawn: int = 0
+  rejected_restless: int = 0  # moved or still moving: objects overlapped
+  rejected_unreachable: int = 0
+  max_position_residual: float = 0.0  # m, by mink
+  max_rotation_residual: float = 0.0  # rad, by mink
+  seconds: float = 0.0  # build time
+
+  def __str__(self) -> str:
+    return (
+      f"{self.drawn:,} drawn; rejected: {self.rejected_restless:,} not at rest, "
+      f"{self.rejected_unreachable:,} out of reach; targets within "
+      f"{1e3 * self.max_position_residual:.2f} mm and "
+      f"{np.degrees(self.max_rotation_residual):.3f} degrees; {self.seconds:.0f} s"
+    )
+
+
+def load_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
+  """Loads the task's bank from the user's cache; builds it first if it is missing."""
+  path = _cache_path(task, rows)
+  if path.exists():
+    with np.load(path, allow_pickle=False) as stored:
+      arrays = dict(stored)
+    report = BankReport(**json.loads(str(arrays.pop("report"))))
+    return ResetBank(**jax.tree.map(jnp.asarray, arrays)), report
+  bank, report = build_bank(task, rows)
+  _store(path, bank, report)
+  return bank, report
+
+
+def build_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
+  """Draws, settles and solves ``rows`` reset states; shows progress on stderr.
+
+  Raises:
+    ConfigError: too many draws were rejected.
+  """
+  began = time.monotonic()
+  rng = np.random.default_rng(SEED)
+  report = BankReport()
+  kept: list[ResetBank] = []
+  # Spawn, because forking a process in which XLA threads run can deadlock.
+  context = multiprocessing.get_context("spawn")
+  with (
+    concurrent.futures.ProcessPoolExecutor(cores(), context) as pool,
+    Progress(console=Console(stderr=True)) as progress,
+  ):
+    bar = progress.add_task(f"reset bank of {task.name}", total=rows)
+    while (missing := rows - sum(bank.rows for bank in kept)) > 0:
+      progress.update(bar, completed=rows - missing)
+      if report.drawn > MAX_DRAWS * rows:
+        raise ConfigError(f"task {task.name!r} has too few usable resets: {report}")
+      state, variant = _settled(task, rng, max(missing, CHUNK), report)
+      if not len(variant):
+        continue
+      advance = functools.partial(progress.advance, bar)
+      solved = _solve_targets(task, state, variant, pool, report, advance)
+      kept.append(jax.tree.map(lambda x: x[:missing], solved))
+    report.seconds = time.monotonic() - began
+    progress.console.print(f"reset bank of {task.name}: {report}", highlight=False)
+  return jax.tree.map(lambda *parts: jnp.concatenate(parts), *kept), report
+
+
+def _settled(
+  task: Task, rng: np.random.Generator, count: int, report: BankReport
+) -> tuple[physics.PhysicsState, Array]:
+  """Returns drawn states that stay at rest while the arm holds still, and variants."""
+  draw = jax.tree.map(jnp.asarray, task.sample_resets(rng, count))
+  state = physics.initial_state(task.scene, *draw)
+  engine = NativePhysics(task.scene, substeps=30)
+  closed = state.qpos[:, task.scene.gripper_qpos] > 0.5
+  for _ in range(SETTLE_PERIODS):
+    state = engine.step(state, jnp.zeros((count, 6)), closed.astype(jnp.float32))
+  restless = np.abs(np.asarray(state.qvel)).max(-1) > SETTLE_SPEED
+  model = task.scene.model
+  for address in model.jnt_qposadr[free_joints(model)]:
+    shift = np.asarray(state.qpos - draw.qpos)[:, address : address + 3]
+    restless |= np.linalg.norm(shift, axis=-1) > SETTLE_SHIFT
+  report.drawn += count
+  report.rejected_restless += int(restless.sum())
+  return jax.tree.map(lambda x: x[~restless], (state, draw.variant))
+
+
+def _solve_targets(
+  task: Task,
+  state: physics.PhysicsState,
+  variant: Array,
+  pool: concurrent.futures.Executor,
+  report: BankReport,
+  advance: Callable[[int], None],
+) -> ResetBank:
+  kinematics = jax.jit(make_kinematics(task.scene))(state)
+  positions, rotations, _ = map(np.asarray, task.tool_targets(state, kinematics))
+  starts = np.asarray(state.qpos[:, task.scene.arm_qpos])
+  arrays = starts, positions, rotations
+  futures = [
+    pool.submit(ik.solve_all, *(x[i : i + CHUNK] for x in arrays))
+    for i in range(0, len(starts), CHUNK)
+  ]
+  for future in concurrent.futures.as_completed(futures):
+    advance(len(future.result()[0]))
+  solved = zip(*[future.result() for future in futures], strict=True)
+  targets, residuals = map(np.concatenate, solved)
+  reached = (residuals < [ik.POSITION_TOLERANCE, ik.ROTATION_TOLERANCE]).all((1, 2))
+  reached &= np.abs(targets - starts[:, None]).max((1, 2)) < MAX_TRAVEL
+  report.rejected_unreachable += int((~reached).sum())
+  worst = residuals[reached].max((0, 1), initial=0.0)
+  report.max_position_residual = max(report.max_position_residual, float(worst[0]))
+  report.max_rotation_residual = max(report.max_rotation_residual, float(worst[1]))
+  return ResetBank(
+    qpos=state.qpos[reached],
+    mocap_pos=state.mocap_pos[reached],
+    mocap_quat=state.mocap_quat[reached],
+    variant=variant[reached],
+    targets=jnp.asarray(targets[reached], jnp.float32),
+  )
+
+
+def _cache_path(task: Task, rows: int) -> pathlib.Path:
+  key = json.dumps(
+    [VERSION, SEED, rows, task.name, task.scene.fingerprint, _source(task)]
+  )
+  digest = hashlib.sha256(key.encode()).hexdigest()[:16]
+  return cache_dir() / "banks" / f"{task.name}-{rows}-{digest}.npz"
+
+
+def _source(task: Task) -> str:
+  """Returns a hash of the task's file and of the files shared by tasks."""
+  own = pathlib.Path(inspect.getfile(type(task)))
+  digest = hashlib.sha256(own.read_bytes())
+  for path in sorted(own.parent.glob("*.py")):
+    if "\n@register_task\n" not in (text := path.read_text(encoding="utf-8")):
+      digest.update(text.encode())
+  return digest.hexdigest()
+
+
+def _store(path: pathlib.Path, bank: ResetBank, report: BankReport) -> None:
+  """Writes atomically, so that no concurrent run reads an incomplete file."""
+  path.parent.mkdir(parents=True, exist_ok=True)
+  arrays: dict[str, Any] = jax.tree.map(np.asarray, vars(bank))
+  with tempfile.NamedTemporaryFile(
+    dir=path.parent, suffix=".npz", delete=False
+  ) as file:
+    np.savez(file, report=json.dumps(dataclasses.asdict(report)), **arrays)
+  os.replace(file.name, path)

@@ -1,0 +1,116 @@
+"""Gives every episode a world of its own.
+
+What is drawn goes into ``PhysicsState.fields``, which both engines, the kinematics and
+the cameras read, so it costs no recompilation and videos show it. Constants that MuJoCo
+derives from masses and sizes are derived, too (``objects``).
+
+The table stays where it is: it is the robot that stands lower or higher, tilted or
+turned on it. Tasks can then go on to measure from the table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from apnpql_jax.config.ranges import RandomizationConfig
+from apnpql_jax.randomization import objects, visuals
+from apnpql_jax.randomization.draw import Draw, World
+from apnpql_jax.sim.physics import GRIPPER_SPEED, PhysicsState
+from apnpql_jax.sim.scene import Scene
+from apnpql_jax.types import Array
+
+WRIST_SHARE = 0.1
+"""How much less than the global camera that on the wrist is shifted."""
+
+Randomize = Callable[[PhysicsState, Array], PhysicsState]
+"""(states at rest [worlds, ...], keys [worlds]) -> the same in worlds of their own."""
+
+
+def make_randomize(config: RandomizationConfig, scene: Scene) -> Randomize:
+  """The function that gives episodes worlds of their own."""
+
+  def one(state: PhysicsState, key: Array) -> PhysicsState:
+    draw, world = Draw(key, config), World(scene.model, state.fields)
+    visuals.color(draw, world)
+    visuals.texture(draw, world)
+    visuals.light(draw, world)
+    _cameras(draw, world)
+    _table(draw, world)
+    qpos = objects.scale(draw, world, state.qpos)
+    objects.weigh(draw, world)
+    if config.size or config.shape or config.mass:
+      objects.derive(world)
+    _contacts(draw, world)
+    command = _control(draw, world, scene, qpos)
+    return state.replace(qpos=qpos, fields=world.fields, command=command)
+
+  return jax.vmap(one)
+
+
+def _cameras(draw: Draw, world: World) -> None:
+  config, count = draw.config, world.model.ncam
+  if config.camera_shift:
+    far = np.where(world.model.cam_bodyid == 0, 1.0, WRIST_SHARE).astype(np.float32)
+    shift = draw.uniform("camera_shift", (count, 3))
+    world["cam_pos"] = world["cam_pos"] + far[:, None] * shift
+  if config.camera_turn:
+    turn = draw.uniform("camera_turn", (count, 3))
+    world["cam_quat"] = _turned(world["cam_quat"], turn)
+  if config.field_of_view:
+    world["cam_fovy"] = world["cam_fovy"] * draw.share("field_of_view", (count,))
+
+
+def _table(draw: Draw, world: World) -> None:
+  config, base = draw.config, world.model.body("base").id
+  if config.table_height:
+    lower = jnp.append(jnp.zeros(2), -draw.uniform("table_height"))
+    world["body_pos"] = world["body_pos"].at[base].add(lower)
+  if config.table_tilt or config.table_turn:
+    turn = jnp.append(draw.uniform("table_tilt", (2,)), draw.uniform("table_turn"))
+    quat = world["body_quat"]
+    # In the world's axes, hence the inverse of a turn in the base's.
+    level = _turned(_inverse(quat[base]), -turn)
+    world["body_quat"] = quat.at[base].set(_inverse(level))
+
+
+def _contacts(draw: Draw, world: World) -> None:
+  if draw.config.friction:
+    world["pair_friction"] = world["pair_friction"] * draw.share("friction")
+
+
+def _control(draw: Draw, world: World, scene: Scene, qpos: Array) -> Array | None:
+  """Damping, gripper and delay; returns what commands begin with if they are late."""
+  config, model = draw.config, world.model
+  if config.damping:
+    robot = model.body_rootid[model.dof_bodyid] == model.body("base").id
+    rate = jnp.abs(draw.uniform("damping", (model.nv,)))
+    added = jnp.where(robot, rate * world["dof_M0"], 0.0)
+    world["dof_damping"] = world["dof_damping"] + added
+  if config.gripper_speed:
+    world["gripper_speed"] = GRIPPER_SPEED * draw.share("gripper_speed")
+  if not config.delay_s:
+    return None
+  longest = round(config.delay_s / model.opt.timestep)
+  steps = jax.random.randint(draw.stream("delay_s"), (), 0, longest + 1)
+  world["control_delay"] = steps.astype(jnp.float32)
+  closed = (qpos[scene.gripper_qpos] > 0.5).astype(jnp.float32)
+  return jnp.append(jnp.zeros(6), closed)
+
+
+def _turned(quat: Array, turn: Array) -> Array:
+  """Unit quaternions f32[*b, 4] after small turns f32[*b, 3] about their own axes."""
+  w, x, y, z = jnp.moveaxis(quat, -1, 0)
+  a, b, c = jnp.moveaxis(0.5 * turn, -1, 0)
+  turned = jnp.stack(
+    [w - x * a - y * b - z * c, x + w * a + y * c - z * b, y + w * b + z * a - x * c,
+     z + w * c + x * b - y * a], axis=-1
+  )  # fmt: skip
+  return turned / jnp.linalg.norm(turned, axis=-1, keepdims=True)
+
+
+def _inverse(quat: Array) -> Array:
+  return quat * jnp.asarray([1.0, -1.0, -1.0, -1.0])

@@ -1,0 +1,179 @@
+"""Checkpoint reading: the newest one that is intact and belongs to the run.
+
+Items of a checkpoint are read one by one, because an evaluation needs the learner
+alone. Each is verified against the record of the checkpoint, see ``checkpoint_record``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import json
+import logging
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from apnpql_jax.config.files import config_diff, config_from_json, format_diff
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.errors import FileError, UserError, one_line
+from apnpql_jax.runs import checkpoint_record, leaves
+from apnpql_jax.runs.checkpoint_record import (
+  DamagedError,
+  best,
+  newest_until,
+  title,
+)
+from apnpql_jax.runs.run_folder import MAY_CHANGE
+
+all_steps = checkpoint_record.steps
+
+
+class Restored(NamedTuple):
+  """Result of ``restore``."""
+
+  step: int
+  items: dict[str, Any]
+  """Item -> pytree, as requested."""
+
+  steps: dict[str, int]
+  """Item -> step of the checkpoint that holds it: ``step`` or an earlier one."""
+
+  damaged: list[str]
+  """One line for each newer checkpoint that could not be used."""
+
+
+def latest_step(run_dir: Path) -> int | None:
+  """Returns the step of the newest complete checkpoint; None if there is none."""
+  return max(all_steps(run_dir), default=None)
+
+
+def best_step(run_dir: Path) -> int | None:
+  """Returns the step with the highest success rate; None if none was evaluated.
+
+  Of equal rates the newest wins.
+  """
+  records = checkpoint_record.read_all(run_dir)
+  return best({step: record.success_rate for step, record in records.items()})
+
+
+def check(run_dir: Path, step: int | None, *, config: TrainConfig | None = None) -> int:
+  """Rejects checkpoints that cannot be restored, before anything else is built.
+
+  Args:
+    run_dir: the run folder.
+    step: the checkpoint; None selects the newest one with a readable record.
+    config: as in ``restore``.
+
+  Returns:
+    The step.
+
+  Raises:
+    FileError: there is no such checkpoint, or it belongs to another configuration
+      or format.
+  """
+  steps = _candidates(run_dir, step)
+  damaged: list[str] = []
+  for candidate in steps:
+    try:
+      record = checkpoint_record.read(run_dir, candidate)
+    except DamagedError as error:
+      damaged.append(str(error))
+      continue
+    if config is not None:
+      _check_config(title(run_dir, candidate), record.config, config)
+    return candidate
+  raise DamagedError("; ".join(damaged))
+
+
+def restore(
+  run_dir: Path,
+  step: int | None,
+  examples: Mapping[str, Any],
+  *,
+  config: TrainConfig | None = None,
+) -> Restored:
+  """Restores items of a checkpoint with the exact bits that were saved.
+
+  An item that the checkpoint lacks comes from the newest earlier one that holds it.
+
+  Args:
+    run_dir: the run folder.
+    step: the checkpoint, without fallback; None selects the newest readable one.
+    examples: item -> a pytree of the same structure, with arrays or
+      ShapeDtypeStructs. The latter, as from ``jax.eval_shape``, save the memory of a
+      second state.
+    config: if given, the configuration that the checkpoint must have, except for
+      settings that a resumed run may change.
+
+  Raises:
+    FileError: there is no such checkpoint, it belongs to another configuration or
+      format, its leaves differ from the example, or its files cannot be read.
+  """
+  damaged: list[str] = []
+  for candidate in _candidates(run_dir, step):
+    try:
+      check(run_dir, candidate, config=config)
+      steps = {name: _step_with(run_dir, candidate, name) for name in examples}
+      items = {
+        name: _restore_item(run_dir, steps[name], name, example)
+        for name, example in examples.items()
+      }
+      return Restored(candidate, items, steps, damaged)
+    except DamagedError as error:
+      damaged.append(str(error))
+  raise DamagedError("; ".join(damaged))
+
+
+def _candidates(run_dir: Path, step: int | None) -> list[int]:
+  """Returns the requested step, or all steps, newest first."""
+  steps = all_steps(run_dir)
+  if not steps:
+    raise FileError(f"{str(run_dir)!r} has no checkpoint")
+  if step is None:
+    return steps[::-1]
+  if step not in steps:
+    valid = ", ".join(map(str, steps))
+    raise FileError(f"{str(run_dir)!r} has no checkpoint {step}; choose from {valid}")
+  return [step]
+
+
+def _check_config(name: str, saved: Any, wanted: TrainConfig) -> None:
+  try:
+    diff = config_diff(config_from_json(json.dumps(saved)), wanted)
+  except UserError as error:
+    raise FileError(f"{name}: {error}") from None
+  diff = {field: pair for field, pair in diff.items() if field not in MAY_CHANGE}
+  if diff:
+    raise FileError(f"{name} belongs to other settings: {format_diff(diff)}")
+
+
+def _step_with(run_dir: Path, last: int, item: str) -> int:
+  records = checkpoint_record.read_all(run_dir)
+  holding = [step for step, record in records.items() if item in record.items]
+  step = newest_until(last, holding)
+  if step is None:
+    raise DamagedError(f"{title(run_dir, last)} and those before it lack the {item}")
+  return step
+
+
+def _restore_item(run_dir: Path, step: int, item: str, example: Any) -> Any:
+  import orbax.checkpoint as ocp
+
+  name = title(run_dir, step)
+  saved = checkpoint_record.read(run_dir, step).items[item]
+  checkpoint_record.check_kinds(name, saved, example)
+  try:
+    with ocp.StandardCheckpointer() as reader:
+      path = checkpoint_record.folder(run_dir) / str(step) / item
+      tree = reader.restore(path, leaves.abstract(example))
+  except (MemoryError, PermissionError):
+    raise  # Not caused by the checkpoint.
+  except Exception as error:  # Any error of Orbax or the file system.
+    # Orbax's abandoned tasks would log pages of tracebacks.
+    logging.getLogger("asyncio").setLevel(logging.CRITICAL)
+    raise DamagedError(f"{name} cannot be read: {one_line(error)}") from error
+  checkpoint_record.check_bits(name, saved, tree)
+  impls = {path: leaf.key_impl for path, leaf in saved.items() if leaf.key_impl}
+  try:
+    return leaves.to_typed(tree, impls, example)
+  except (TypeError, ValueError) as error:
+    raise DamagedError(f"{name} cannot be read: {one_line(error)}") from None

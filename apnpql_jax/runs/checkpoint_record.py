@@ -1,0 +1,178 @@
+"""Record of a checkpoint: its configuration, success rate and leaves.
+
+The record is read before the arrays, so that a wrong, damaged or oversized checkpoint
+is rejected before memory is allocated for it. It holds checksums of the leaves and of
+itself, because Orbax silently casts a leaf of another dtype and misses flipped bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+import zlib
+
+from apnpql_jax.config.files import config_to_json
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.errors import FileError, UserError, one_line
+from apnpql_jax.runs import leaves, text
+
+SCHEMA_VERSION = 2
+"""Version of the format; incremented whenever the format changes."""
+
+_MAX_BYTES = 16 << 20
+"""Limit for the file of a record, which takes a few hundred bytes per leaf."""
+
+
+class DamagedError(FileError):
+  """A checkpoint that differs from what was written; an older one may be intact."""
+
+
+class Leaf(NamedTuple):
+  """One array of a checkpoint."""
+
+  kind: str
+  """dtype and shape, such as ``uint8[4, 72, 96, 3]``."""
+
+  key_impl: str | None
+  """Name of the generator if the leaf is a typed PRNG key."""
+
+  crc32: int
+  """Checksum of the bytes."""
+
+
+class Record(NamedTuple):
+  """Content that ``describe`` wrote and ``read`` verified."""
+
+  config: dict[str, Any]
+  success_rate: float | None
+  items: dict[str, dict[str, Leaf]]
+  """Item -> path -> leaf; a checkpoint may lack items that older ones hold."""
+
+
+def describe(
+  config: TrainConfig, items: Mapping[str, Any], success_rate: float | None
+) -> dict[str, Any]:
+  """Returns the record for a checkpoint of ``items`` (name -> pytree) as JSON data."""
+  record = {
+    "schema_version": SCHEMA_VERSION,
+    "config": json.loads(config_to_json(config)),
+    "success_rate": None if success_rate is None else float(success_rate),
+    "items": {name: _describe_leaves(tree) for name, tree in items.items()},
+  }
+  return record | {"crc32": _checksum(record)}
+
+
+def read(run_dir: Path, step: int) -> Record:
+  """Returns the record of a checkpoint.
+
+  Raises:
+    DamagedError: the record is missing or differs from what was written.
+    FileError: the record has another format.
+  """
+  path = folder(run_dir) / str(step) / "meta" / "metadata"
+  name = title(run_dir, step)
+  try:
+    record = json.loads(text.read_text(path, _MAX_BYTES))
+    version, crc32 = record["schema_version"], record.pop("crc32", None)
+    whole = crc32 == _checksum(record)
+    if version != SCHEMA_VERSION and (whole or crc32 is None):
+      raise FileError(
+        f"{name} has format {str(version)[:20]}; this code reads {SCHEMA_VERSION}"
+      )
+    if not whole:
+      raise DamagedError(f"{name} is damaged: its record is not what was saved")
+    items = {
+      item: {path: Leaf(*leaf) for path, leaf in tree.items()}
+      for item, tree in record["items"].items()
+    }
+    rate = record["success_rate"]
+    return Record(record["config"], None if rate is None else float(rate), items)
+  except UserError:
+    raise
+  except (
+    OSError,
+    ValueError,
+    RecursionError,
+    LookupError,
+    TypeError,
+    AttributeError,
+  ) as e:
+    raise DamagedError(f"{name} cannot be read: {one_line(e)}") from None
+
+
+def read_all(run_dir: Path) -> dict[int, Record]:
+  """Returns step -> record, ascending, of each readable checkpoint of a run."""
+  records = {}
+  for step in steps(run_dir):
+    try:
+      records[step] = read(run_dir, step)
+    except UserError:  # Reported when this checkpoint is requested.
+      continue
+  return records
+
+
+def steps(run_dir: Path) -> list[int]:
+  """Returns the steps of the complete checkpoints of a run, ascending."""
+  from orbax.checkpoint import utils
+
+  return sorted(utils.checkpoint_steps(folder(run_dir)))
+
+
+def folder(run_dir: Path) -> Path:
+  """Returns the folder of the checkpoints of a run."""
+  return run_dir.absolute() / "checkpoints"
+
+
+def title(run_dir: Path, step: int) -> str:
+  """Returns the name of a checkpoint for messages."""
+  return f"checkpoint {step} of {str(run_dir)!r}"
+
+
+def best(rates: Mapping[int, float | None]) -> int | None:
+  """Returns the newest step with the highest rate; None if there is no rate."""
+  known = {step: rate for step, rate in rates.items() if rate is not None}
+  return max(known, key=lambda step: (known[step], step), default=None)
+
+
+def newest_until(last: int, steps: Iterable[int]) -> int | None:
+  """Returns the largest of ``steps`` up to ``last``; None if there is none."""
+  return max((step for step in steps if step <= last), default=None)
+
+
+def check_kinds(name: str, saved: Mapping[str, Leaf], example: Any) -> None:
+  """Rejects leaves whose name, dtype or shape differs from those of ``example``.
+
+  Raises:
+    FileError: names the first leaf that differs.
+  """
+  wanted = leaves.describe(example)
+  for path in sorted(saved.keys() | wanted.keys()):
+    held = saved[path].kind if path in saved else "nothing"
+    expected = wanted.get(path, "nothing")
+    if held != expected:
+      raise FileError(f"{name} holds {held} at {path}, where {expected} is expected")
+
+
+def check_bits(name: str, saved: Mapping[str, Leaf], tree: Any) -> None:
+  """Compares the leaves that were read with the saved checksums.
+
+  Raises:
+    DamagedError: names the first leaf that differs.
+  """
+  for path, crc32 in leaves.checksums(tree).items():
+    if crc32 != saved[path].crc32:
+      raise DamagedError(f"{name} is damaged: {path} is not what was saved")
+
+
+def _describe_leaves(tree: Any) -> dict[str, Leaf]:
+  impls, crc32s = leaves.key_impls(tree), leaves.checksums(tree)
+  return {
+    path: Leaf(kind, impls.get(path), crc32s[path])
+    for path, kind in leaves.describe(tree).items()
+  }
+
+
+def _checksum(record: dict[str, Any]) -> int:
+  return zlib.crc32(json.dumps(record, sort_keys=True).encode())

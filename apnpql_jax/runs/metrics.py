@@ -1,0 +1,243 @@
+"""Metrics of a run: the rows of ``metrics.jsonl``, and the success curve."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+import json
+import math
+from pathlib import Path
+import time
+from typing import Any, Protocol
+
+from apnpql_jax.errors import FileError
+from apnpql_jax.runs.text import write_text
+
+STEP = "step"
+"""Environment steps, summed over worlds; every row has it."""
+
+WALL = "time/wall_s"
+"""Seconds of training, including those before a resume."""
+
+SUCCESS = "eval/success_rate"
+EPISODES = "eval/episodes"
+
+MAX_BYTES = 32 << 20
+"""Size above which ``metrics.jsonl`` is renamed to ``metrics.<n>.jsonl``."""
+
+Row = dict[str, float | None]
+
+
+def wilson_interval(successes: int, n: int) -> tuple[float, float]:
+  """Returns the 95 % score interval (Wilson, 1927) of a success rate.
+
+  Unlike the normal approximation, it stays within [0, 1] and does not shrink to a point
+  at 0 or ``n`` successes.
+
+  Args:
+    successes: between 0 and ``n``.
+    n: independent episodes; 0 gives (0, 1).
+
+  Raises:
+    ValueError: ``successes`` is not within [0, n].
+  """
+  if successes == n == 0:
+    return 0.0, 1.0
+  from scipy.stats import binomtest  # Here, because its import slows the start.
+
+  low, high = binomtest(successes, n).proportion_ci(method="wilson")
+  return float(low), float(high)
+
+
+class Sink(Protocol):
+  """An additional destination for metrics."""
+
+  def write(self, step: int, row: Mapping[str, float]) -> None:
+    """Receives the metrics of one step."""
+    ...
+
+  def close(self) -> None:
+    """Flushes what is still buffered."""
+    ...
+
+
+class MetricWriter:
+  """Appends rows to ``metrics.jsonl``; each is on disk when ``write`` returns.
+
+  A file that has grown too large is renamed to ``metrics.<n>.jsonl``, starting at 1.
+  """
+
+  def __init__(
+    self,
+    run_dir: Path,
+    *,
+    resume_step: int | None = None,
+    sinks: Sequence[Sink] = (),
+    clock: Callable[[], float] = time.monotonic,
+    max_bytes: int = MAX_BYTES,
+  ):
+    """Opens the file and keeps its rows.
+
+    Args:
+      run_dir: an existing run folder.
+      resume_step: drops the rows of later steps; the run repeats those steps.
+      sinks: additional destinations; closed together with this writer.
+      clock: returns seconds; only differences matter.
+      max_bytes: size of ``metrics.jsonl`` above which a new file begins.
+
+    Raises:
+      FileError: a row cannot be read.
+    """
+    self._path = run_dir / "metrics.jsonl"
+    self._sinks, self._clock, self._max_bytes = tuple(sinks), clock, max_bytes
+    rows = self._rows_until(resume_step)
+    # Rewritten, because a killed process may have left half a line.
+    write_text(self._path, "".join(_json_line(row) for row in rows))
+    self._start = clock() - ((rows[-1].get(WALL) or 0.0) if rows else 0.0)
+
+  def write(self, step: int, metrics: Mapping[str, Any]) -> None:
+    """Adds one row.
+
+    Args:
+      step: environment steps done.
+      metrics: name -> number or array of one element. Values that are not finite
+        become null in the file.
+    """
+    numbers = {name: _number(value) for name, value in metrics.items()}
+    row: Row = {STEP: step, WALL: round(self._clock() - self._start, 3), **numbers}
+    with self._path.open("a", encoding="utf-8") as file:
+      file.write(_json_line(row))
+    if self._path.stat().st_size > self._max_bytes:
+      self._path.rename(_numbered(self._path, len(metric_files(self._path.parent))))
+    for sink in self._sinks:
+      sink.write(step, numbers)
+
+  def close(self) -> None:
+    """Closes the sinks; the file is always complete."""
+    for sink in self._sinks:
+      sink.close()
+
+  def __enter__(self) -> MetricWriter:
+    return self
+
+  def __exit__(self, *exception: object) -> None:
+    self.close()
+
+  def _rows_until(self, step: int | None) -> list[Row]:
+    """Returns the rows up to ``step`` of the newest file that has any.
+
+    That file becomes ``metrics.jsonl`` again.
+    """
+    rows = read_rows(self._path)
+    if step is None:
+      return rows
+    kept = [row for row in rows if (row[STEP] or 0) <= step]
+    if not kept and (number := len(metric_files(self._path.parent)) - 1) > 0:
+      _numbered(self._path, number).replace(self._path)
+      return self._rows_until(step)
+    return kept
+
+
+def metric_files(run_dir: Path) -> list[Path]:
+  """Returns the metric files of a run, oldest first; the last may not exist."""
+  current, renamed = run_dir / "metrics.jsonl", []
+  while (path := _numbered(current, len(renamed) + 1)).exists():
+    renamed.append(path)
+  return [*renamed, current]
+
+
+def read_evaluations(run_dir: Path) -> list[Row]:
+  """Returns the rows of all evaluations of a run, oldest first."""
+  key = json.dumps(SUCCESS)
+  rows = (row for path in metric_files(run_dir) for row in read_rows(path, having=key))
+  return [row for row in rows if row.get(SUCCESS) is not None]
+
+
+def _numbered(path: Path, number: int) -> Path:
+  return path.with_suffix(f".{number}{path.suffix}")
+
+
+def read_rows(path: Path, *, having: str = "") -> list[Row]:
+  """Returns the rows of a metric file, oldest first; none if there is no file.
+
+  Args:
+    path: the file.
+    having: skips lines without this text, so that the few evaluations of a long run
+      are read without parsing all of its rows.
+
+  Raises:
+    FileError: a line other than an incomplete last one is not a row.
+  """
+  if not path.exists():
+    return []
+  rows = []
+  with path.open(encoding="utf-8", errors="replace") as file:
+    for number, line in enumerate(file, start=1):
+      if not line.endswith("\n"):
+        break
+      if having not in line:
+        continue
+      try:
+        row = json.loads(line)
+        row[STEP] + 0
+      except (ValueError, TypeError, KeyError):
+        raise FileError(f"{path}, line {number}: not a row of metrics") from None
+      rows.append(row)
+  return rows
+
+
+def plot_curve(rows: Sequence[Row], path: Path, *, title: str = "") -> bool:
+  """Draws the success rate over environment steps and over wall-clock minutes.
+
+  The band is the 95 % interval, for rows that hold the number of episodes.
+
+  Returns:
+    False, without drawing, if no row is an evaluation.
+  """
+  rows = [row for row in rows if row.get(SUCCESS) is not None]
+  if not rows:
+    return False
+  # Not pyplot, which would choose a display for the whole process.
+  from matplotlib.backends.backend_agg import FigureCanvasAgg
+  from matplotlib.figure import Figure
+
+  rates = [row[SUCCESS] or 0.0 for row in rows]
+  low, high = zip(*map(_interval, rows), strict=True)
+  figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+  FigureCanvasAgg(figure)
+  axes = figure.subplots(1, 2, sharey=True)
+  steps = [row[STEP] or 0.0 for row in rows]
+  minutes = [(row.get(WALL) or 0.0) / 60 for row in rows]
+  for axis, x, label in zip(
+    axes, (steps, minutes), ("environment steps", "wall-clock minutes"), strict=True
+  ):
+    axis.plot(x, [100 * rate for rate in rates], marker=".", color="C0")
+    band = [[100 * bound for bound in bounds] for bounds in (low, high)]
+    axis.fill_between(x, *band, alpha=0.25, color="C0", linewidth=0)
+    axis.set(xlabel=label, ylim=(-2, 102))
+    axis.grid(alpha=0.3)
+  axes[0].set_ylabel("success of held-out episodes, %")
+  figure.suptitle(title)
+  part = path.with_name(path.name + ".part")
+  figure.savefig(part, dpi=120, format="png")
+  part.replace(path)
+  return True
+
+
+def _interval(row: Row) -> tuple[float, float]:
+  rate, episodes = row[SUCCESS] or 0.0, row.get(EPISODES)
+  if not episodes:
+    return rate, rate
+  return wilson_interval(round(rate * episodes), int(episodes))
+
+
+def _number(value: Any) -> float:
+  value = value.item() if hasattr(value, "item") else value
+  return int(value) if isinstance(value, int) else float(value)
+
+
+def _json_line(row: Row) -> str:
+  plain = {
+    name: value if value is None or math.isfinite(value) else None
+    for name, value in row.items()
+  }
+  return json.dumps(plain, allow_nan=False) + "\n"

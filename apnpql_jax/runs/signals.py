@@ -1,0 +1,83 @@
+"""SIGINT and SIGTERM of a run: when to finish and save, and when to end at once.
+
+Python runs signal handlers between two of its instructions, and a compilation or a
+save is minutes of one: a thread therefore watches for what has to end at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from typing import Any
+
+from apnpql_jax.errors import INTERRUPTED
+
+_ONE_REQUEST_S = 1.0
+"""Signals this close are one request: `timeout` and batch systems send it twice."""
+
+
+class Signals:
+  """Collects signals while it is entered; only the main thread may enter it.
+
+  A signal ends the process at once, with one line and exit code ``INTERRUPTED`` plus
+  its number, if nothing is to be saved yet or if it is the second.
+  """
+
+  def __init__(self, words: str):
+    """Nothing is to be saved yet; ``words`` say how to go on in that case."""
+    self.caught: list[int] = []
+    self._words, self._patient = words, False
+
+  def finish_first(self, words: str) -> None:
+    """From now on the first signal is only collected; ``words`` are for the second."""
+    self._words, self._patient = words, True
+
+  def __enter__(self) -> Signals:
+    self._woken, self._wake = os.pipe()
+    os.set_blocking(self._wake, False)  # As the interpreter wants it.
+    self._wake_before = signal.set_wakeup_fd(self._wake)
+    self._before: dict[int, Any] = {
+      number: signal.signal(number, lambda number, _: self.caught.append(number))
+      for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    threading.Thread(target=self._watch, daemon=True).start()
+    return self
+
+  def __exit__(self, *exception: object) -> None:
+    for number, handler in self._before.items():
+      signal.signal(number, handler)
+    signal.set_wakeup_fd(self._wake_before)
+    os.close(self._wake)
+
+  def _watch(self) -> None:
+    """Reads what the interpreter writes as soon as a signal comes: its number."""
+    first = None
+    while byte := os.read(self._woken, 1):
+      if byte[0] not in self._before:
+        continue
+      now = time.monotonic()
+      if not self._patient or first is not None and now - first > _ONE_REQUEST_S:
+        self._end(byte[0])
+      if first is None:
+        first = now
+        _write("finishing this iteration, then saving; once more to stop at once")
+    os.close(self._woken)
+
+  def _end(self, number: int) -> None:
+    for child in multiprocessing.active_children():
+      child.kill()  # They would wait for work for ever.
+    if sys.stderr.isatty():
+      os.write(2, b"\x1b[?25h")  # The cursor, which a progress bar hides.
+    _write(f"apnpql: {self._words}")
+    os._exit(INTERRUPTED + number)
+
+
+def _write(line: str) -> None:
+  """Past Python's buffers, whose locks the main thread may hold."""
+  with contextlib.suppress(OSError):  # It may lie on a disk that is full.
+    os.write(2, (line + "\n").encode())

@@ -1,0 +1,202 @@
+"""Tiny runs and random batches, for tests and benchmarks.
+
+The runs are as small as a run can be and still be real. Their processes compile without
+optimization, because nobody waits for such a run to be fast.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+
+from apnpql_jax.config.schema import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
+from apnpql_jax.data import demonstrations
+from apnpql_jax.primitives.reset_bank import load_bank
+from apnpql_jax.runs import metrics
+from apnpql_jax.tasks import make_task
+from apnpql_jax.types import Observation, Slot, TimeStep, Transition
+
+ROOT = Path(__file__).resolve().parents[1]
+
+FAST_COMPILE = {
+  "xla_backend_optimization_level": 0,
+  "xla_llvm_disable_expensive_passes": True,
+}
+XLA_FLAGS = " ".join(f"--{name}={value}" for name, value in FAST_COMPILE.items())
+"""The same for the environment of a process."""
+
+TINY = TrainConfig(
+  env=EnvConfig(worlds=4, bank_rows=256, obs="state", backend="native"),
+  agent=AgentConfig(
+    n_step=2,
+    hidden=(16, 16),
+    feature_dim=16,
+    target_samples=4,
+    policy_samples=4,
+    # Room for each algorithm: all must take steps from the first update on.
+    m_step_delay=0,
+  ),
+  replay=ReplayConfig(capacity=64, expert_steps=32, expert_share=0.5, batch_size=8),
+  total_steps=64,
+  rollout_length=2,
+  updates_per_iteration=2,
+  eval_every=1_000_000,
+  eval_episodes=4,
+  checkpoint_every=16,
+  video=False,
+)
+STEPS = TINY.env.worlds * TINY.rollout_length
+"""Environment steps per iteration."""
+
+TINY_ARGS = (
+  "--env.worlds 4 --env.bank-rows 256 --obs state --backend native --agent.n-step 2 "
+  "--agent.hidden 16 16 --agent.feature-dim 16 --agent.target-samples 4 "
+  "--agent.policy-samples 4 --agent.m-step-delay 0 --replay.capacity 64 "
+  "--replay.expert-steps 32 --replay.expert-share 0.5 --replay.batch-size 8 "
+  "--rollout-length 2 --updates-per-iteration 2 --eval-every 1000000 "
+  "--eval-episodes 4 --checkpoint-every 16 --no-video"
+).split()
+"""Options that turn the preset push_plate into ``TINY``."""
+
+
+def start(
+  run_dir: Path,
+  *args: str,
+  said: Path,
+  log_compiles: bool = False,
+  xla_flags: str = XLA_FLAGS,
+) -> subprocess.Popen[bytes]:
+  """Trains in a new process, or goes on if ``run_dir`` is a run; stderr to ``said``."""
+  command = [sys.executable, "-m", "apnpql_jax", "train"]
+  if (run_dir / "config.json").exists():
+    command += ["--resume", str(run_dir)]
+  else:
+    command += ["push_plate", "--run", str(run_dir), *TINY_ARGS]
+  env = os.environ | {"XLA_FLAGS": xla_flags, "PYTHONPATH": str(ROOT)}
+  env |= {"JAX_LOG_COMPILES": "1"} if log_compiles else {}
+  with said.open("ab") as file:
+    return subprocess.Popen(
+      [*command, *args], cwd=said.parent, env=env, stdout=file, stderr=file
+    )
+
+
+def write_demonstrations(path: Path) -> None:
+  """A file of four episodes of four instants, in which the arm holds still."""
+  env = TINY.env
+  task = make_task(env.task)
+  bank, _ = load_bank(task, env.bank_rows)
+  rows = np.arange(16) // 4
+  still = demonstrations.Demonstrations(
+    qpos=np.asarray(bank.qpos)[rows],
+    qvel=np.zeros((16, task.scene.model.nv), np.float32),
+    mocap_pos=np.asarray(bank.mocap_pos)[rows],
+    mocap_quat=np.asarray(bank.mocap_quat)[rows],
+    variant=np.asarray(bank.variant)[rows],
+    action=np.zeros((16, 7), np.float32),
+    first=np.arange(16) % 4 == 0,
+  )
+  period_s = env.control_period_s
+  demonstrations.save(path, still, task=env.task, control_period_s=period_s)
+
+
+def rows(run_dir: Path) -> list[dict[str, Any]]:
+  """Whole rows of the metrics of a run; none if it has not begun."""
+  files = [path for path in metrics.metric_files(run_dir) if path.exists()]
+  lines = [line for path in files for line in path.read_text().splitlines(True)]
+  return [json.loads(line) for line in lines if line.endswith("\n")]
+
+
+def saved_arrays(run_dir: Path, step: int) -> dict[str, np.ndarray]:
+  """Every array of a checkpoint, read by Orbax alone."""
+  found = {}
+  for item in ("learner", "rest", "replay"):
+    with ocp.StandardCheckpointer() as reader:
+      tree = reader.restore((run_dir / "checkpoints" / str(step) / item).absolute())
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+      found[f"{item} {path}"] = np.asarray(leaf)
+  return found
+
+
+def saved_bytes(run_dir: Path, step: int) -> dict[str, bytes]:
+  """The bits of ``saved_arrays``."""
+  return {name: x.tobytes() for name, x in saved_arrays(run_dir, step).items()}
+
+
+SMALL = AgentConfig(
+  hidden=(16, 16),
+  feature_dim=16,
+  num_atoms=11,
+  target_samples=8,
+  policy_samples=8,
+  patch_channels=4,
+  conv_channels=4,
+  n_step=2,
+)
+"""Compiles in a few seconds, whichever row of Table I it is given."""
+
+
+def random_batch(
+  seed: int,
+  batch: int = 16,
+  *,
+  pixels: bool = False,
+  windows: int = 0,
+  instants: int = 0,
+) -> Transition:
+  """Transitions with noise for everything; if asked with images, with a window of N
+  instants, and with observations of L instants each."""
+  rng = np.random.default_rng(seed)
+
+  def normal(*shape: int) -> jax.Array:
+    return jnp.asarray(rng.normal(size=shape), jnp.float32)
+
+  def flags(*shape: int) -> jax.Array:
+    return jnp.asarray(rng.random(shape) < 0.3)
+
+  def image(*shape: int) -> jax.Array | None:
+    return jnp.asarray(rng.integers(0, 256, shape), jnp.uint8) if pixels else None
+
+  def observation(*shape: int) -> Observation:
+    shape += (instants,) * bool(instants)
+    return Observation(
+      robot=normal(*shape, 21),
+      tool=0.3 * normal(*shape, 3),
+      global_image=image(*shape, 72, 96, 3),
+      wrist_image=image(*shape, 36, 64, 3),
+      objects=0.3 * normal(*shape, 9),
+    )
+
+  def action(*shape: int) -> jax.Array:
+    gripper = jnp.asarray(rng.integers(0, 2, (*shape, 1)), jnp.float32)
+    return jnp.concatenate([jnp.tanh(normal(*shape, 6)), gripper], axis=-1)
+
+  def slots(*shape: int) -> Slot:
+    timestep = TimeStep(
+      observation=observation(*shape),
+      reward=normal(*shape),
+      terminated=flags(*shape),
+      truncated=flags(*shape),
+      primitives=action(*shape, 3),
+    )
+    return Slot(timestep, action(*shape), log_prob=normal(*shape))
+
+  success = flags(batch).astype(jnp.float32)
+  return Transition(
+    observation_tm1=observation(batch),
+    action_tm1=action(batch),
+    reward_t=success,
+    discount_t=0.97 * (1.0 - success),
+    observation_t=observation(batch),
+    primitives_tm1=action(batch, 3),
+    weight=jnp.ones(batch),
+    window=slots(batch, windows) if windows else None,
+  )

@@ -1,0 +1,1 @@
+"""Training: rollouts, the jitted iteration and the host loop around it."""

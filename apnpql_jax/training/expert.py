@@ -1,0 +1,193 @@
+"""The expert's replay: from the scripted expert or from demonstrations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from apnpql_jax.config.schema import EnvConfig, TrainConfig
+from apnpql_jax.data import demonstrations, replay
+from apnpql_jax.data.demonstrations import Demonstrations
+from apnpql_jax.data.replay import Replay
+from apnpql_jax.envs.env import Env, make_env
+from apnpql_jax.envs.state import Arrival, EnvState
+from apnpql_jax.errors import FileError
+from apnpql_jax.primitives import ik
+from apnpql_jax.sim import physics
+from apnpql_jax.sim.physics import PhysicsState
+from apnpql_jax.sim.scene import Scene
+from apnpql_jax.training.placement import place
+from apnpql_jax.training.rollout import expert_policy, rollout
+from apnpql_jax.types import ACTION_DIM, Array, Slot
+
+ExpertReplay = Callable[[TrainConfig, Env, Array], Replay | None]
+
+CERTAIN = 100.0
+"""nats; log density of actions whose policy is not known: so high that Retrace does not
+correct for it but cuts the trace."""
+
+
+def example_slot(worlds: EnvState) -> Slot:
+  """Shapes and dtypes of one replay slot of one world."""
+  action: Any = jax.ShapeDtypeStruct((ACTION_DIM,), jnp.float32)
+  log_prob: Any = jax.ShapeDtypeStruct((), jnp.float32)
+  timestep = jax.tree.map(
+    lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), worlds.timestep
+  )
+  return Slot(timestep=timestep, action=action, log_prob=log_prob)
+
+
+def empty_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:
+  """An expert's replay with nothing in it, for who needs its shapes only."""
+  del key
+  worlds = config.env.worlds
+  length = config.replay.expert_steps // worlds
+  if not length:
+    return None
+  state = jax.eval_shape(env.reset, jnp.zeros(worlds, jnp.int32))
+  return replay.create(example_slot(state), length, worlds)
+
+
+def collect_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:
+  """The expert's replay: ``replay.expert_steps`` slots of its noisy episodes."""
+  worlds = config.env.worlds
+  length = config.replay.expert_steps // worlds
+  if not length:
+    return None
+  policy = expert_policy(env, noise=config.replay.expert_noise)
+  row_key, play_key = jax.random.split(key)
+  rows = jax.random.randint(row_key, (worlds,), 0, env.bank_split)
+
+  @jax.jit
+  def collect(state: EnvState, key: Array) -> Replay:
+    after, chunk = rollout(env, policy, state, key, length=length)
+    ring = replay.create(example_slot(state), length, worlds)
+    return place(add_chunk(ring, state, after, chunk), env.mesh)
+
+  return collect(env.reset(rows), play_key)
+
+
+def add_chunk(ring: Replay, before: EnvState, after: EnvState, chunk: Slot) -> Replay:
+  """Adds a chunk; of a world that broke in it, the episode and the rest is excluded."""
+  steps = before.elapsed + chunk.action.shape[0]
+  broken = after.faults > before.faults
+  return replay.exclude(replay.add(ring, chunk), jnp.where(broken, steps, 0))
+
+
+def replay_from_demonstrations(
+  demos: Demonstrations, config: TrainConfig, env: Env
+) -> Replay:
+  """The expert's replay of ``replay.expert_steps`` slots, made from demonstrations.
+
+  Each column of the ring holds a stretch of them, one after the other; they are
+  repeated if there are not enough, and those too many are left out.
+  """
+  worlds = config.env.worlds
+  length = config.replay.expert_steps // worlds
+  n = demos.instants
+  index = np.resize(np.arange(n), (worlds, length)).T
+  fresh = demos.first[index]
+  fresh[0] = True  # A column may begin in the middle of an episode.
+  ends = np.append(demos.first[1:], True)[index]
+  targets = np.zeros((length, worlds, 3, 6), np.float32)
+  targets[fresh] = _solve_targets(demos, index[fresh], env)
+
+  @jax.jit
+  def remake(
+    start: EnvState, index: Array, fresh: Array, targets: Array, ends: Array
+  ) -> Replay:
+    def instant(before: EnvState, seen: tuple) -> tuple[EnvState, Slot]:
+      rows, fresh, targets, ends = seen
+      now = _states(demos, env.task.scene, rows)
+      state = env.observe(Arrival.after(before, now, targets, fresh))
+      timestep = state.timestep
+      timestep = timestep.replace(
+        truncated=timestep.truncated | ends & ~timestep.terminated
+      )
+      action = jnp.asarray(demos.action, jnp.float32)[rows]
+      return state, Slot(timestep, action, jnp.full(worlds, CERTAIN, jnp.float32))
+
+    _, chunk = jax.lax.scan(instant, start, (index, fresh, targets, ends))
+    ring = replay.add(replay.create(example_slot(start), length, worlds), chunk)
+    return place(ring, env.mesh)
+
+  start = env.reset(jnp.zeros(worlds, jnp.int32))
+  return remake(start, *map(jnp.asarray, (index, fresh, targets, ends)))
+
+
+def save_expert(path: Path, config: EnvConfig, **settings: Any) -> dict[str, Any]:
+  """``record_expert`` into a file."""
+  demos = record_expert(make_env(config), **settings)
+  period_s = config.control_period_s
+  return demonstrations.save(path, demos, task=config.task, control_period_s=period_s)
+
+
+def record_expert(
+  env: Env, *, episodes: int, seed: int, noise: float
+) -> Demonstrations:
+  """Episodes of the task's scripted expert, up to success or time-out.
+
+  They begin at rows of the bank that training sees. Those in which the world was not
+  finite are left out.
+  """
+  policy = expert_policy(env, noise=noise)
+  row_key, key = jax.random.split(jax.random.key(seed))
+  rows = jax.random.randint(row_key, (episodes,), 0, env.bank_split)
+
+  @jax.jit
+  def play(start: EnvState, key: Array):
+    def period(state: EnvState, key: Array):
+      policy_key, env_key = jax.random.split(key)
+      action, _ = policy(state, policy_key)
+      after = env.step(state, action, env_key)
+      return after, (state.physics, action, state.timestep.last, state.faults)
+
+    keys = jax.random.split(key, env.config.episode_steps + 1)
+    return jax.lax.scan(period, start, keys)[1]
+
+  played = play(env.reset(rows), key)
+  state, action, last, faults = jax.tree.map(np.asarray, played)
+  end = last.argmax(0)  # The first last instant; all sound episodes end in time.
+  sound = last.any(0) & (faults[end, np.arange(episodes)] == 0)
+  inside = (np.arange(len(last))[:, None] <= np.where(sound, end, -1)).T
+  take = lambda x: np.moveaxis(x, 1, 0)[inside]  # noqa: E731 - a name for one index
+  first = np.zeros_like(inside)
+  first[:, 0] = True
+  variant = np.asarray(env.variant(rows))[:, None].repeat(len(last), 1)
+  return Demonstrations(
+    *(take(x) for x in (state.qpos, state.qvel, state.mocap_pos, state.mocap_quat)),
+    variant[inside],
+    take(action),
+    first[inside],
+  )
+
+
+def _states(demos: Demonstrations, scene: Scene, rows: Array) -> PhysicsState:
+  f32 = {
+    name: jnp.asarray(getattr(demos, name), jnp.float32)[rows]
+    for name in ("qpos", "qvel", "mocap_pos", "mocap_quat")
+  }
+  qvel = f32.pop("qvel")
+  state = physics.initial_state(scene, **f32, variant=jnp.asarray(demos.variant)[rows])
+  return state.replace(qvel=qvel)
+
+
+def _solve_targets(demos: Demonstrations, rows: np.ndarray, env: Env) -> np.ndarray:
+  """f32[len(rows), 3, 6], where the primitives lead when an episode begins."""
+  unique, inverse = np.unique(rows, return_inverse=True)
+  state = _states(demos, env.task.scene, jnp.asarray(unique))
+  positions, rotations, _ = map(np.asarray, env.tool_targets(state))
+  starts = np.asarray(state.qpos[:, env.task.scene.arm_qpos])
+  targets, residuals = ik.solve_all(starts, positions, rotations)
+  far = (residuals > [ik.POSITION_TOLERANCE, ik.ROTATION_TOLERANCE]).any((1, 2))
+  if far.any():
+    raise FileError(
+      f"demonstrations: the arm cannot reach a primitive's target at instant "
+      f"{unique[far.argmax()]}"
+    )
+  return targets.astype(np.float32)[inverse]

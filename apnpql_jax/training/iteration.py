@@ -1,0 +1,121 @@
+"""The state of a run and the one pure function that moves it on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import (
+  Mesh,
+  NamedSharding,
+  PartitionSpec,
+)
+
+from apnpql_jax.agents.learner import Agent
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.data import replay
+from apnpql_jax.envs.env import Env
+from apnpql_jax.training.expert import add_chunk
+from apnpql_jax.training.placement import place
+from apnpql_jax.training.rollout import agent_policy, rollout
+from apnpql_jax.training.state import Faults, TrainState
+from apnpql_jax.types import Array, Metrics, Slot, Transition
+
+Iteration = Callable[[TrainState], tuple[TrainState, Metrics]]
+
+
+def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
+  """The jitted iteration (paper Algorithm 1): rollouts, then gradient steps.
+
+  The state is donated: the caller must go on with the one returned.
+  """
+  sample = make_sample(config, agent, env.mesh)
+
+  def iteration(state: TrainState) -> tuple[TrainState, Metrics]:
+    key, rollout_key, update_key = jax.random.split(state.key, 3)
+    policy = agent_policy(agent, state.learner.target_params, greedy=False)
+    worlds, chunk = rollout(
+      env, policy, state.env, rollout_key, length=config.rollout_length
+    )
+    ring = add_chunk(state.replay, state.env, worlds, chunk)
+    keys = jax.random.split(update_key, config.updates_per_iteration)
+    update = functools.partial(_update, agent, sample, ring, state.expert_replay)
+    (learner, faults), (metrics, ok) = jax.lax.scan(
+      update, (state.learner, state.faults), keys
+    )
+    metrics = {name: jnp.mean(x, where=ok) for name, x in metrics.items()}
+    metrics |= _rollout_metrics(chunk) | {
+      "faults/worlds": (worlds.faults - state.env.faults).sum(),
+      "faults/updates": (~ok).sum(),
+      "faults/updates_in_a_row": faults.in_a_row,
+    }
+    steps = config.rollout_length * config.env.worlds
+    state = state.replace(
+      learner=learner,
+      env=worlds,
+      replay=ring,
+      key=key,
+      env_steps=state.env_steps + steps,
+      faults=faults,
+    )
+    return place((state, metrics), env.mesh)
+
+  return jax.jit(iteration, donate_argnums=0)
+
+
+def _update(agent, sample, ring, expert_replay, carry, key) -> Any:
+  """One update for ``scan``: it is skipped, and counted, if it is not finite."""
+  learner, faults = carry
+  sample_key, learn_key = jax.random.split(key)
+  batch = sample(ring, expert_replay, sample_key)
+  updated, metrics = agent.update(learner, batch, learn_key)
+  # The norms of the gradients tell of all losses and parameters; a reward that is not
+  # finite, however, can get lost in the limits of the projection.
+  norms = {k: v for k, v in metrics.items() if k.startswith("grad_norm/")}
+  ok = all_finite((batch, norms, updated.nu))
+  learner = jax.tree.map(functools.partial(jnp.where, ok), updated, learner)
+  faults = Faults(
+    in_a_row=jnp.where(ok, 0, faults.in_a_row + 1),
+    key=jnp.where(ok, faults.key, key),
+  )
+  return (learner, faults), (metrics, ok)
+
+
+def make_sample(
+  config: TrainConfig, agent: Agent, mesh: Mesh | None = None
+) -> Callable[..., Transition]:
+  """(replay, expert replay, key) -> the batch of one update, [B, ...]."""
+  draw = functools.partial(
+    replay.sample_mixed,
+    batch_size=config.replay.batch_size,
+    expert_share=config.replay.expert_share,
+    n_step=config.agent.n_step,
+    gamma=config.agent.gamma,
+    windows=agent.evaluation.windows,
+    instants=config.agent.lstm_instants,
+  )
+  if mesh is None:
+    return draw
+
+  def sample(*args: Any) -> Transition:
+    # Whole at first: XLA would split the draws too, and collect them piece by piece.
+    whole = NamedSharding(mesh, PartitionSpec())
+    return place(jax.lax.with_sharding_constraint(draw(*args), whole), mesh)
+
+  return sample
+
+
+def all_finite(tree: Any) -> Array:
+  """bool[]: no leaf holds a NaN or an infinity."""
+  return jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(tree)]).all()
+
+
+def _rollout_metrics(chunk: Slot) -> Metrics:
+  return {
+    "rollout/successes": chunk.timestep.terminated.sum(),
+    "rollout/timeouts": chunk.timestep.truncated.sum(),
+    "rollout/close_share": chunk.action[..., -1].mean(),
+  }

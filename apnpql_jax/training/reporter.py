@@ -1,0 +1,103 @@
+"""What a run tells while it trains: metrics, progress, evaluations, curve and video."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import jax
+
+from apnpql_jax import devices
+from apnpql_jax.agents.learner import Agent
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.envs.env import Env
+from apnpql_jax.runs.metrics import MetricWriter, plot_curve, read_evaluations
+from apnpql_jax.runs.progress import TrainProgress
+from apnpql_jax.runs.run_folder import RunFolder
+from apnpql_jax.training.evaluate import figures_of, play_held_out
+from apnpql_jax.training.rollout import agent_policy, make_player
+from apnpql_jax.training.state import TrainState
+from apnpql_jax.training.video import record_episodes
+
+EVAL_SEED = 1
+"""Evaluations during training always play the same held-out episodes."""
+
+
+class Silent:
+  """The reporter of processes that leave it to the first one."""
+
+  def __init__(self, folder: RunFolder):
+    """Nothing will be written into the folder."""
+    self.folder = folder
+    self.evaluation: dict[str, Any] = {}
+
+  def iteration(self, step: int, updates: int, metrics: dict[str, Any]) -> None:
+    """Does nothing."""
+
+  def evaluate(self, step: int, state: TrainState, *, last: bool) -> None:
+    """Does nothing."""
+
+  def write(self, step: int, figures: dict[str, Any]) -> None:
+    """Does nothing."""
+
+
+class Reporter:
+  """Metrics, progress, evaluation, curve and videos of a run."""
+
+  def __init__(
+    self,
+    config: TrainConfig,
+    env: Env,
+    agent: Agent,
+    folder: RunFolder,
+    writer: MetricWriter,
+    progress: TrainProgress,
+  ):
+    """Builds the player of evaluations; nothing is compiled yet."""
+    self._config, self._env, self.folder = config, env, folder
+    self._writer, self._progress = writer, progress
+    self._play = make_player(
+      env, lambda params: agent_policy(agent, params, greedy=False)
+    )
+    self._lap = time.monotonic()
+    self.evaluation: dict[str, Any] = {}
+
+  def iteration(self, step: int, updates: int, metrics: dict[str, Any]) -> None:
+    """Writes the row of one iteration; blocks until it has been computed."""
+    metrics = jax.device_get(metrics)
+    now = time.monotonic()
+    seconds, self._lap = now - self._lap, now
+    config = self._config
+    steps = config.rollout_length * config.env.worlds
+    metrics["time/sps_e2e"] = steps / seconds
+    metrics["time/updates_per_s"] = config.updates_per_iteration / seconds
+    self._writer.write(step, metrics)
+    self._progress.update(step, updates=updates)
+
+  def write(self, step: int, figures: dict[str, Any]) -> None:
+    """Adds a row to the metrics."""
+    self._writer.write(step, figures)
+
+  def evaluate(self, step: int, state: TrainState, *, last: bool) -> float:
+    """Plays held-out episodes, writes their row, the curve and, at last, a video."""
+    began = time.monotonic()
+    config, folder = self._config, self.folder
+    params = devices.local(state.learner.target_params)
+    played = play_held_out(
+      self._env, self._play, params, episodes=config.eval_episodes, seed=EVAL_SEED
+    )
+    self.evaluation = figures = figures_of(played)
+    row = {f"eval/{name}": value for name, value in figures.items() if name != "ci95"}
+    row["eval/ci95_low"], row["eval/ci95_high"] = figures["ci95"]
+    self._writer.write(step, row | {"eval/wall_s": time.monotonic() - began})
+    plot_curve(read_evaluations(folder.path), folder.curve, title=config.env.task)
+    if config.video and last:
+      record_episodes(self._env, played, folder.videos / f"step_{step:08d}.mp4")
+    rate = figures["success_rate"]
+    self._progress.message(
+      f"step {step:,}: {figures['successes']} of {figures['episodes']} held-out "
+      f"episodes solved ({100 * rate:.0f} %)"
+    )
+    self._progress.update(step, updates=int(state.learner.step), success_rate=rate)
+    self._lap = time.monotonic()
+    return rate

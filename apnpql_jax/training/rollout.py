@@ -1,0 +1,131 @@
+"""Policies at work in the worlds: loops over time, batched over worlds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from flax import struct
+import jax
+import jax.numpy as jnp
+
+from apnpql_jax.agents.heads import Params
+from apnpql_jax.agents.learner import Agent
+from apnpql_jax.envs.env import Env
+from apnpql_jax.envs.state import EnvState
+from apnpql_jax.sim.physics import PhysicsState
+from apnpql_jax.types import ARM_DOF, Array, Slot
+
+Policy = Callable[[EnvState, Array], tuple[Array, Array]]
+"""(worlds, key) -> actions f32[worlds, 7], their log densities f32[worlds]."""
+
+FILMED = 4
+"""Episodes of a batch that can be filmed: the first ones."""
+
+_LEAST_NOISE = 1e-6
+"""Deviation in rad/s that stands for none: its density outweighs any policy's."""
+
+
+def agent_policy(agent: Agent, params: Params, *, greedy: bool) -> Policy:
+  """The learned policy; sees observations only."""
+
+  def policy(state: EnvState, key: Array) -> tuple[Array, Array]:
+    action, info = agent.act(params, state.observation, key, greedy)
+    return action, info["log_prob"]
+
+  return policy
+
+
+def expert_policy(env: Env, *, noise: float) -> Policy:
+  """The scripted expert with Gaussian noise on its joint velocities.
+
+  Args:
+    env: the worlds, whose task knows the expert.
+    noise: standard deviation, rad/s.
+  """
+
+  def policy(state: EnvState, key: Array) -> tuple[Array, Array]:
+    action = env.expert_action(state)
+    mean = action[..., :ARM_DOF]
+    velocity = (mean + noise * jax.random.normal(key, mean.shape)).clip(-1.0, 1.0)
+    density = jax.scipy.stats.norm.logpdf(
+      velocity, mean, jnp.maximum(noise, _LEAST_NOISE)
+    )
+    action = jnp.concatenate([velocity, action[..., ARM_DOF:]], axis=-1)
+    return action, jnp.sum(density, axis=-1)
+
+  return policy
+
+
+def rollout(
+  env: Env, policy: Policy, state: EnvState, key: Array, *, length: int
+) -> tuple[EnvState, Slot]:
+  """Plays ``length`` control periods in every world, episode after episode.
+
+  Returns:
+    the worlds afterwards, and what was seen and done, leaves [length, worlds, ...].
+  """
+
+  def period(state: EnvState, key: Array) -> tuple[EnvState, Slot]:
+    policy_key, env_key = jax.random.split(key)
+    action, log_prob = policy(state, policy_key)
+    slot = Slot(timestep=state.timestep, action=action, log_prob=log_prob)
+    return env.step(state, action, env_key), slot
+
+  return jax.lax.scan(period, state, jax.random.split(key, length))
+
+
+class Episodes(struct.PyTreeNode):
+  """One episode per world."""
+
+  success: Array  # bool[worlds]
+  length: Array  # i32[worlds]: control periods until success or time-out
+  states: PhysicsState  # [time, <= FILMED, ...]: instants 0 to ``length`` of the first
+
+
+Player = Callable[[Any, Array, Array], Episodes]
+"""(parameters of the policy, bank rows i32[worlds], key) -> episodes."""
+
+
+def make_player(env: Env, make_policy: Callable[[Any], Policy]) -> Player:
+  """A jitted function that plays one episode per row and stops when all are over.
+
+  What a world does after a fault is not counted.
+  """
+
+  @jax.jit
+  def play(params: Any, rows: Array, key: Array) -> Episodes:
+    policy = make_policy(params)
+
+    def instant(carry):
+      now, played, running, time, key = carry
+      state = env.observe(now)
+      running &= state.faults == 0
+      played = Episodes(
+        success=played.success | running & state.timestep.terminated,
+        length=jnp.where(running, state.elapsed, played.length),
+        states=jax.tree.map(
+          lambda kept, x: jax.lax.dynamic_update_index_in_dim(
+            kept, x[: kept.shape[1]], time, axis=0
+          ),
+          played.states,
+          state.physics,
+        ),
+      )
+      key, policy_key, env_key = jax.random.split(key, 3)
+      now = env.advance(state, policy(state, policy_key)[0], env_key)
+      return now, played, running & ~state.timestep.last, time + 1, key
+
+    now, worlds = env.begin(rows), rows.shape[0]
+    shape = (env.config.episode_steps + 1, min(worlds, FILMED))
+    nothing = Episodes(
+      success=jnp.zeros(worlds, bool),
+      length=jnp.zeros(worlds, jnp.int32),
+      states=jax.tree.map(
+        lambda x: jnp.zeros(shape + x.shape[1:], x.dtype), now.physics
+      ),
+    )
+    start = (now, nothing, jnp.ones(worlds, bool), 0, key)
+    return jax.lax.while_loop(lambda carry: carry[2].any(), instant, start)[1]
+
+  return play

@@ -1,0 +1,76 @@
+"""The state of a run: everything needed to go on."""
+
+from __future__ import annotations
+
+from flax import struct
+import jax
+import jax.numpy as jnp
+
+from apnpql_jax.agents.learner import Agent, LearnerState
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.data import replay
+from apnpql_jax.data.replay import Replay
+from apnpql_jax.envs.env import Env
+from apnpql_jax.envs.state import EnvState
+from apnpql_jax.training.expert import ExpertReplay, empty_expert, example_slot
+from apnpql_jax.training.placement import place, shardings
+from apnpql_jax.types import Array
+
+
+class Faults(struct.PyTreeNode):
+  """Updates that were skipped because something in them was not finite."""
+
+  in_a_row: Array  # i32[]: those at the end of what has been done so far
+  key: Array  # typed PRNG key of the last one, from which it can be repeated
+
+
+class TrainState(struct.PyTreeNode):
+  """Everything needed to go on."""
+
+  learner: LearnerState
+  env: EnvState  # [worlds, ...]
+  replay: Replay
+  expert_replay: Replay | None
+  key: Array  # typed PRNG key
+  env_steps: Array  # i32[]: environment steps done, summed over worlds
+  faults: Faults
+
+
+def initial_state(
+  config: TrainConfig, env: Env, agent: Agent, expert: ExpertReplay
+) -> TrainState:
+  """The state before the first iteration; ``expert`` fills the expert's replay."""
+  keys = jax.random.split(jax.random.key(config.seed), 5)
+  key, row_key, init_key, expert_key, fault_key = keys
+  rows = jax.random.randint(row_key, (config.env.worlds,), 0, env.bank_split)
+
+  @jax.jit
+  def start(
+    worlds: EnvState, key: Array, init_key: Array, fault_key: Array
+  ) -> TrainState:
+    length = config.replay.capacity // config.env.worlds
+    state = TrainState(
+      learner=agent.init(init_key, worlds.observation),
+      env=worlds,
+      replay=replay.create(example_slot(worlds), length, config.env.worlds),
+      expert_replay=None,
+      key=key,
+      env_steps=jnp.zeros((), jnp.int32),
+      faults=Faults(in_a_row=jnp.zeros((), jnp.int32), key=fault_key),
+    )
+    return place(state, env.mesh)
+
+  state = start(env.reset(rows), key, init_key, fault_key)
+  state = state.replace(expert_replay=expert(config, env, expert_key))
+  # Bound to its devices, as a restored state is, so that both make the same program.
+  return jax.device_put(state, shardings(state, env.mesh))
+
+
+def example_state(config: TrainConfig, env: Env, agent: Agent) -> TrainState:
+  """Shapes, dtypes and devices of the state, without taking memory for it."""
+  state = jax.eval_shape(lambda: initial_state(config, env, agent, empty_expert))
+  return jax.tree.map(
+    lambda x, where: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=where),
+    state,
+    shardings(state, env.mesh),
+  )

@@ -1,0 +1,231 @@
+"""The host loop around the jitted iteration: report, evaluate, save, stop cleanly.
+
+Everything needed to go on is in ``TrainState``; nothing here is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+import contextlib
+import dataclasses
+import logging
+from pathlib import Path
+import signal
+from typing import Any
+
+from jax.sharding import Mesh
+
+from apnpql_jax import devices, errors
+from apnpql_jax.agents.learner import Agent, make_agent
+from apnpql_jax.config import codec
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.console import say
+from apnpql_jax.data import demonstrations, replay
+from apnpql_jax.envs.env import Env, make_env
+from apnpql_jax.errors import RunStopped
+from apnpql_jax.runs import checkpoint_reader, leaves, run_folder, versions
+from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
+from apnpql_jax.runs.metrics import MetricWriter
+from apnpql_jax.runs.progress import TrainProgress
+from apnpql_jax.runs.run_folder import RunFolder
+from apnpql_jax.runs.signals import Signals
+from apnpql_jax.runs.sinks import check_sinks, make_sinks
+from apnpql_jax.training import expert, faults
+from apnpql_jax.training.expert import ExpertReplay, collect_expert
+from apnpql_jax.training.iteration import make_iteration
+from apnpql_jax.training.reporter import Reporter, Silent
+from apnpql_jax.training.resume import restore, set_aside, to_items
+from apnpql_jax.training.state import TrainState, example_state, initial_state
+
+
+@dataclasses.dataclass(frozen=True)
+class Start:
+  """A run about to go on."""
+
+  env: Env
+  agent: Agent
+  folder: RunFolder
+  state: TrainState
+  resume_step: int | None
+  """Step it goes on from; None if it is new."""
+
+
+def train(
+  config: TrainConfig,
+  run_dir: Path,
+  *,
+  resume: bool = False,
+  overwrite: bool = False,
+  mesh: Mesh | None = None,
+) -> dict[str, Any]:
+  """Trains to ``config.total_steps``, or until a signal, then saves.
+
+  Args:
+    config: everything that decides the run.
+    run_dir: the run folder.
+    resume: go on from the newest checkpoint of ``run_dir`` that is whole.
+    overwrite: replace the run that ``run_dir`` holds, once the new one can start.
+    mesh: the devices to train on; the default one if None.
+
+  Returns:
+    the run folder, steps, updates and the last evaluation.
+
+  Raises:
+    ConfigError: before anything is written.
+    RunStopped: SIGINT or SIGTERM came, and the state is saved; or the run cannot go
+      on, and its checkpoints are as they were.
+  """
+  to_go_on = f"to go on: --resume {run_dir}"
+  with Signals(
+    "stopped before the first iteration was done; "
+    + (to_go_on if resume else "nothing is saved")
+  ) as signals:
+    start = _start(config, run_dir, mesh, resume=resume, overwrite=overwrite)
+    _say(f"run folder {start.folder.path}; compiling, which can take minutes")
+    try:
+      state, evaluation = _run(config, start, signals)
+    except OSError as error:  # The disk is full or gone.
+      raise RunStopped(f"{error}; {to_go_on}", errors.FAILED) from error
+  if int(state.env_steps) < config.total_steps:
+    # The signal may have come to another process.
+    number = signals.caught[0] if signals.caught else signal.SIGTERM
+    raise RunStopped(
+      f"saved at step {int(state.env_steps):,}; {to_go_on}", errors.INTERRUPTED + number
+    )
+  return {
+    "run": str(start.folder.path),
+    "env_steps": int(state.env_steps),
+    "updates": int(state.learner.step),
+    **evaluation,
+  }
+
+
+def _run(
+  config: TrainConfig, start: Start, signals: Signals
+) -> tuple[TrainState, dict[str, Any]]:
+  """Opens what is written to, and trains; returns the last evaluation too."""
+  path = start.folder.path
+  with (
+    run_folder.lock(path) if devices.is_primary() else contextlib.nullcontext(),
+    _reporting(config, start) as reporter,
+    CheckpointWriter(path, config, keep=config.keep_checkpoints) as saver,
+  ):
+    iteration: Any = make_iteration(config, start.env, start.agent)
+    if start.env.mesh is not None:
+      iteration = iteration.lower(start.state).compile()
+      devices.barrier()
+    state = _loop(config, iteration, start.state, reporter, saver, signals)
+    if figures := saver.finished(wait=True):
+      reporter.write(int(state.env_steps), figures)
+  return state, reporter.evaluation
+
+
+@contextlib.contextmanager
+def _reporting(
+  config: TrainConfig, start: Start
+) -> Generator[Reporter | Silent, None, None]:
+  """Opens the metrics and the progress; of several processes, the first one tells."""
+  devices.run_on_primary(lambda: _set_aside(start))
+  if not devices.is_primary():
+    yield Silent(start.folder)
+    return
+  path = start.folder.path
+  sinks = make_sinks(config.sinks, path, dict(codec.flatten(config)))
+  with (
+    MetricWriter(path, resume_step=start.resume_step, sinks=sinks) as writer,
+    TrainProgress(config.total_steps) as progress,
+  ):
+    env = start.env.on_one_device()
+    yield Reporter(config, env, start.agent, start.folder, writer, progress)
+
+
+def _set_aside(start: Start) -> None:
+  path, step = start.folder.path, start.resume_step
+  if step is not None and (aside := set_aside(path, step)):
+    _say(f"later checkpoints, and the metrics until then, are now in {aside}")
+
+
+def _start(
+  config: TrainConfig,
+  run_dir: Path,
+  mesh: Mesh | None,
+  *,
+  resume: bool,
+  overwrite: bool,
+) -> Start:
+  """Builds or restores everything; makes the folder last."""
+  # What Orbax logs of a save that fails, tracebacks of each thread, is said by us.
+  logging.getLogger("absl").setLevel(logging.CRITICAL)
+  check_sinks(config.sinks)
+  count = mesh.size if mesh else 1
+  if resume:
+    folder = run_folder.open_run(run_dir)
+    for change in versions.changed_versions(folder.versions, devices=count):
+      _say(f"not as when the run began: {change}")
+  saved = resume and checkpoint_reader.latest_step(run_dir) is not None
+  if saved:
+    checkpoint_reader.check(run_dir, None, config=config)
+  env = make_env(config.env, mesh, instants=config.agent.lstm_instants)
+  agent = make_agent(config.agent)
+  example = example_state(config, env, agent)
+  devices.check_memory(leaves.nbytes(example), "the training state")
+  if saved:
+    state = restore(config, run_dir, example, _say)
+    return Start(env, agent, folder, state, int(state.env_steps))
+  state = initial_state(config, env, agent, _expert(config, env))
+  if state.expert_replay is not None:
+    solved, ended = map(int, replay.episodes(state.expert_replay))
+    _say(f"the expert's replay: {solved} of {ended} episodes solved")
+  if resume:
+    _say("it was stopped before its first checkpoint, and begins again")
+    return Start(env, agent, folder, state, 0)
+  devices.run_on_primary(
+    lambda: run_folder.create(run_dir, config, overwrite=overwrite, devices=count)
+  )
+  return Start(env, agent, run_folder.open_run(run_dir), state, None)
+
+
+def _expert(config: TrainConfig, env: Env) -> ExpertReplay:
+  """How the expert's replay is filled: from a file, or by the scripted expert."""
+  if not config.replay.demonstrations:
+    _say("collecting the expert's replay")
+    return collect_expert
+  path = Path(config.replay.demonstrations)
+  demos = demonstrations.load(path, env.task, env.config.control_period_s)
+  _say(f"{demos.instants} instants of {path} for {config.replay.expert_steps} slots")
+  return lambda config, env, _: expert.replay_from_demonstrations(demos, config, env)
+
+
+def _loop(config, iteration, state, reporter, saver, signals) -> TrainState:
+  """Iterates to the last step; evaluates and saves whenever a multiple is passed."""
+  step, stop = int(state.env_steps), False
+  while step < config.total_steps and not stop:
+    before = step
+    state, metrics = iteration(state)
+    step = int(state.env_steps)
+    # Before it is told that an iteration is done, for then there is something to save.
+    signals.finish_first(f"stopped at once; to go on: --resume {reporter.folder.path}")
+    reporter.iteration(step, int(state.learner.step), metrics | saver.finished())
+    faults.check(config, state, reporter.folder)
+    done = step >= config.total_steps
+    rate = None
+    # Who sends a signal may not wait for an evaluation before the state is safe.
+    stop = devices.any_process(signals.caught)
+    if not stop and (done or _passed(before, step, config.eval_every)):
+      rate = reporter.evaluate(step, state, last=done)
+      stop = devices.any_process(signals.caught)
+    last = done or stop
+    whole = _passed(before, step, config.save_replay_every or config.checkpoint_every)
+    if last or whole or _passed(before, step, config.checkpoint_every):
+      items = to_items(state, whole=last or whole or saver.empty)
+      saver.save(step, items, success_rate=rate)
+  return state
+
+
+def _say(text: str) -> None:
+  if devices.is_primary():
+    say(text)
+
+
+def _passed(before: int, now: int, every: int) -> bool:
+  return now // every > before // every

@@ -1,0 +1,86 @@
+"""No batch, however absurd, makes a number that is none."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from apnpql_jax import testing
+from apnpql_jax.agents.learner import make_agent
+from apnpql_jax.agents.table_one import ALGORITHMS
+from apnpql_jax.testing import SMALL, random_batch
+from apnpql_jax.types import Array, Transition
+
+BATCH, ROWS = 6, 32
+KEPT = ("action", "discount", "weight", "terminated", "truncated")
+"""Parts of a transition that are in order whatever happens."""
+
+
+def absurd_images(key: Array, noise: Array) -> Array:
+  """Each image by itself black, white, a board of single pixels, or noise."""
+  row, column = jnp.indices(noise.shape[-3:-1])
+  board = jnp.where((row + column) % 2, 255, 0)[..., None]
+  kind = jax.random.randint(key, (*noise.shape[:-3], 1, 1, 1), 0, 4)
+  plain = jnp.where(kind == 0, 0, 255)
+  pattern = jnp.where(kind == 2, board, plain)
+  return jnp.where(kind == 3, noise, pattern).astype(jnp.uint8)
+
+
+def absurd_batch(rows: Transition, key: Array) -> Transition:
+  """Every leaf with rows, a size up to 1e6, a sign and images of its own."""
+
+  def change(path: Any, leaf: Array, key: Array) -> Array:
+    pick, size, sign, images = jax.random.split(key, 4)
+    leaf = leaf[jax.random.randint(pick, (BATCH,), 0, ROWS)]
+    if leaf.dtype == jnp.uint8:
+      return absurd_images(images, leaf)
+    if any(name in jax.tree_util.keystr(path) for name in KEPT):
+      return leaf
+    scale = 10.0 ** jax.random.uniform(size, minval=-3.0, maxval=6.0)
+    return jax.random.rademacher(sign, (), jnp.float32) * scale * leaf
+
+  leaves, treedef = jax.tree_util.tree_flatten_with_path(rows)
+  keys = jax.random.split(key, len(leaves))
+  pairs = zip(leaves, keys, strict=True)
+  return treedef.unflatten([change(path, leaf, k) for (path, leaf), k in pairs])
+
+
+@pytest.mark.parametrize("updates", [100, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_no_batch_makes_a_number_that_is_none(name: str, updates: int):
+  """Rewards and states of 1e6, images far from any seen, in all combinations."""
+  config = dataclasses.replace(SMALL, algorithm=name)
+  agent = make_agent(config)
+  rows = random_batch(2, ROWS, pixels=True, windows=config.n_step)
+  state = agent.init(jax.random.key(0), rows.observation_tm1)
+
+  def body(state, key):
+    batch = absurd_batch(rows, key)
+    state, metrics = agent.update(state, batch, key)
+    white = jnp.all(batch.observation_tm1.global_image == 255, axis=(-3, -2, -1))
+    rich = jnp.abs(batch.reward_t) > 1e5
+    return state, (metrics, jnp.any(white & rich))
+
+  @functools.partial(jax.jit, compiler_options=testing.FAST_COMPILE)
+  def run(state):
+    keys = jax.random.split(jax.random.key(1), updates)
+    state, seen = jax.lax.scan(body, state, keys)
+    last = absurd_batch(rows, jax.random.key(3)).observation_tm1
+    return state, *seen, *agent.act(state.params, last, jax.random.key(2), False)
+
+  state, metrics, met, action, info = run(state)
+  assert np.any(met)  # A large reward and a white image, in one state.
+  for leaf in jax.tree.leaves((state.params, state.nu, metrics, info)):
+    assert np.all(np.isfinite(leaf))
+  assert action.shape == (BATCH, 7) and np.all(np.abs(action) <= 1.0)
+  assert set(np.unique(action[:, 6])) <= {0.0, 1.0}
+  common = {"q/min", "q/max", "npql/kl_over_eps", "npql/ess", "npql/alpha_mean"}
+  common |= {"prior/entropy", "policy/entropy", "prior/nu", "q/data", "q/target"}
+  common |= {f"grad_norm/{group}" for group in state.params}
+  assert common <= set(metrics)

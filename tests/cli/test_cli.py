@@ -1,0 +1,224 @@
+"""The command line as a user meets it: real processes, their output and exit codes."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+import re
+import subprocess
+import sys
+
+import pytest
+
+from apnpql_jax.cli.main import _plain
+from apnpql_jax.config import files
+from apnpql_jax.config.checks import BACKENDS
+from apnpql_jax.config.files import config_to_json
+from apnpql_jax.config.schema import TrainConfig
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def apnpql(*args: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+  """Runs the command in ``cwd``, as from a shell."""
+  return subprocess.run(
+    [sys.executable, "-m", "apnpql_jax", *args],
+    cwd=cwd,
+    env=dict(os.environ, PYTHONPATH=str(ROOT)),
+    stdin=subprocess.DEVNULL,
+    capture_output=True,
+    text=True,
+    timeout=120,
+    check=False,
+  )
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path) -> Path:
+  """A run folder with nothing but its configuration."""
+  folder = tmp_path / "runs" / "old"
+  folder.mkdir(parents=True)
+  config = files.load_preset("push_plate")
+  (folder / "config.json").write_text(config_to_json(config))
+  return folder
+
+
+def snapshot(folder: Path) -> dict[str, bytes | None]:
+  """Every path under ``folder`` with its content; None for folders."""
+  return {
+    str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
+    for path in sorted(folder.rglob("*"))
+  }
+
+
+BAD_INPUT = [
+  ("", ["train", "evaluate", "collect", "list"]),
+  ("learn", ["'learn'", "train", "evaluate", "collect", "list"]),
+  ("train", ["push_plate"]),
+  ("train nope", ["'nope'", "push_plate"]),
+  ("train ../experiments/push_plate", ["push_plate"]),
+  ("train push_plate extra", ["extra"]),
+  ("train push_plate --epsilonn 1", ["--epsilonn", "apnpql train --help"]),
+  ("train push_plate --agent.epsilo 1", ["--agent.epsilo", "--agent.epsilon"]),
+  ("train push_plate --seed", ["--seed"]),
+  ("train push_plate --seed x", ["--seed", "'x'"]),
+  ("train push_plate --backend bullet", ["'bullet'", *BACKENDS]),
+  ("train push_plate --env.backend bullet", ["'bullet'", *BACKENDS]),
+  ("train push_plate --obs depth", ["'depth'", "pixels", "state"]),
+  ("train push_plate --env.task juggle", ["'juggle'", "push_plate"]),
+  ("train push_plate --algorithm ppo", ["'ppo'", "ap_npql"]),
+  ("train push_plate --agent.epsilon 4.7", ["agent.epsilon", "log(100) = 4.605"]),
+  ("train push_plate --agent.gamma nan", ["agent.gamma", "finite"]),
+  ("train push_plate --replay.capacity 1000", ["replay.capacity", "1024"]),
+  ("train push_plate --replay.capacity 2147483392", ["GiB", "replay.capacity"]),
+  ("train push_plate --replay.expert-share 0.3", ["expert_share=0.296875"]),
+  ("train push_plate --run runs/old", ["--resume", "--overwrite", "--run"]),
+  ("train push_plate --run .", ["not a run", "--run"]),
+  ("train push_plate --run . --overwrite", ["not a run", "--run"]),
+  ("train push_plate --run runs/old/config.json", ["not a folder"]),
+  ("train push_plate --run runs/old --overwrite --env.task juggle", ["push_plate"]),
+  ("train push_plate --resume runs/old --seed 9", ["seed 0 -> 9"]),
+  ("train --resume runs/old --agent.gamma 0.9", ["agent.gamma 0.99 -> 0.9"]),
+  ("train --resume runs/old --run runs/new", ["--resume", "--run"]),
+  ("train --resume runs/new", ["runs/new", "runs/old"]),
+  ("evaluate", ["RUN"]),
+  ("evaluate runs", ["not a run folder", "runs/old"]),
+  ("evaluate runs/old --episodes 0", ["--episodes"]),
+  ("evaluate runs/old --seed -1", ["--seed"]),
+  ("evaluate runs/old --checkpoint last", ["'last'", "newest", "best"]),
+  ("evaluate runs/old", ["no checkpoint"]),
+  ("convert", ["REC.npz", "TASK", "OUT.npz"]),
+  ("convert none.npz juggle out.npz", ["'juggle'", "push_plate"]),
+  ("convert none.npz push_plate out.npz", ["none.npz", "no archive"]),
+  ("repeat", ["RUN/faults/step_<n>.npz"]),
+  ("repeat runs/faults/step_1.npz", ["not a run folder", "runs/old"]),
+  ("repeat runs/old/faults/step_1.npz", ["step_1.npz", "no archive"]),
+  ("evaluate runs/old --backend bullet", ["'bullet'", *BACKENDS]),
+  ("evaluate runs/broken", ["config.json", "'env'", "missing"]),
+  ("collect", ["push_plate"]),
+  ("collect juggle", ["'juggle'", "push_plate"]),
+  ("collect push_plate --backend bullet", ["'bullet'", *BACKENDS]),
+  ("collect push_plate --noise -1", ["--noise"]),
+  ("collect push_plate --noise nan", ["--noise"]),
+  ("collect push_plate --episodes many", ["--episodes", "'many'"]),
+  ("collect push_plate --video runs", ["--video", ".mp4", ".gif"]),
+  ("collect push_plate --video runs/old/config.json/x.mp4", ["--video", "written"]),
+  ("evaluate runs/old --video x.avi", ["--video", ".mp4", ".gif"]),
+  ("list tasks", ["tasks"]),
+]
+
+
+@pytest.mark.parametrize(("line", "words"), BAD_INPUT, ids=[x for x, _ in BAD_INPUT])
+def test_bad_input_ends_with_one_clear_line(line, words, run_dir, tmp_path):
+  broken = tmp_path / "runs" / "broken"
+  broken.mkdir()
+  (broken / "config.json").write_text("{}")
+  before = snapshot(tmp_path)
+  done = apnpql(*line.split(), cwd=tmp_path)
+  assert done.returncode == 2, done.stderr
+  assert len(done.stderr.splitlines()) == 1, done.stderr
+  assert "Traceback" not in done.stderr
+  for word in words:
+    assert word in done.stderr
+  assert snapshot(tmp_path) == before
+
+
+def test_a_run_from_before_a_setting_is_taken_as_it_was(run_dir, tmp_path):
+  data = json.loads((run_dir / "config.json").read_text())
+  del data["agent"]["residual_blocks"]
+  (run_dir / "config.json").write_text(json.dumps(data))
+  for command in ("evaluate runs/old", "train --resume runs/old --seed 9"):
+    done = apnpql(*command.split(), cwd=tmp_path)
+    assert done.returncode == 2
+    told, refused = done.stderr.splitlines()
+    assert told.endswith("which keep their old behavior: agent.residual_blocks 0")
+    assert "no checkpoint" in refused or "seed 0 -> 9" in refused
+
+
+def test_bad_input_with_json_leaves_standard_output_empty(tmp_path):
+  done = apnpql("collect", "juggle", "--json", cwd=tmp_path)
+  assert (done.returncode, done.stdout) == (2, "")
+
+
+def test_list_prints_one_json_object_and_nothing_else(tmp_path):
+  done = apnpql("list", "--json", cwd=tmp_path)
+  assert done.returncode == 0, done.stderr
+  names = json.loads(done.stdout)
+  assert done.stdout.count("\n") == 1
+  assert list(names) == ["tasks", "presets", "algorithms", "backends"]
+  assert "push_plate" in names["tasks"]
+  assert "push_plate" in names["presets"]
+  assert "ap_npql" in names["algorithms"]
+  assert names["backends"] == list(BACKENDS)
+
+
+def test_list_for_people_names_the_same(tmp_path):
+  done = apnpql("list", cwd=tmp_path)
+  assert done.returncode == 0
+  for word in ("tasks", "push_plate", "ap_npql", *BACKENDS):
+    assert word in done.stdout
+
+
+def test_help_names_every_command_and_every_setting(tmp_path):
+  done = apnpql("--help", cwd=tmp_path)
+  assert done.returncode == 0
+  for word in ("train", "evaluate", "collect", "list"):
+    assert word in done.stdout
+  done = apnpql("train", "--help", cwd=tmp_path)
+  assert done.returncode == 0
+  config = TrainConfig()
+  for prefix, part in (("", config), ("env.", config.env), ("agent.", config.agent)):
+    for field in dataclasses.fields(part):
+      if not dataclasses.is_dataclass(getattr(part, field.name)):
+        assert f"--{prefix}{field.name.replace('_', '-')}" in done.stdout
+
+
+def test_help_of_a_preset_shows_its_settings(tmp_path):
+  done = apnpql("train", "push_plate", "--help", cwd=tmp_path)
+  shown = re.sub(r"[\s│]+", " ", done.stdout)
+  preset = files.load_preset("push_plate")
+  assert preset.total_steps != TrainConfig().total_steps
+  assert f"(default: {preset.total_steps})" in shown
+
+
+def test_help_imports_neither_jax_nor_mujoco(tmp_path):
+  code = (
+    "import sys; from apnpql_jax.cli.main import main; assert main(['--help']) == 0;"
+    "heavy = {'jax', 'mujoco', 'flax', 'numpy', 'matplotlib'} & set(sys.modules);"
+    "sys.exit(str(heavy) if heavy else 0)"
+  )
+  env = dict(os.environ, PYTHONPATH=str(ROOT))
+  done = subprocess.run(
+    [sys.executable, "-c", code], cwd=tmp_path, env=env, capture_output=True, text=True
+  )
+  assert done.returncode == 0, done.stderr
+
+
+def test_version(tmp_path):
+  done = apnpql("--version", cwd=tmp_path)
+  assert done.returncode == 0
+  assert done.stdout.strip() == __import__("apnpql_jax").__version__
+
+
+def test_results_become_plain_json():
+  import jax.numpy as jnp
+  import numpy as np
+
+  value = {
+    "rate": np.float32(0.5),
+    "n": np.int64(3),
+    "ci95": (jnp.float32(0.25), float("nan")),
+    "run": Path("runs/a"),
+    "flag": np.bool_(True),
+    "none": None,
+  }
+  assert json.loads(json.dumps(_plain(value), allow_nan=False)) == {
+    "rate": 0.5,
+    "n": 3,
+    "ci95": [0.25, None],
+    "run": "runs/a",
+    "flag": True,
+    "none": None,
+  }

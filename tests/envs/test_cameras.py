@@ -1,0 +1,49 @@
+"""Cameras of the environment: whose shadow falls on what."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+from apnpql_jax import testing
+from apnpql_jax.config.schema import EnvConfig
+from apnpql_jax.envs.cameras import make_cameras, shadows_of_the_hand
+from apnpql_jax.render import CameraSpec, Geoms, Lighting, render
+from apnpql_jax.sim.kinematics import make_kinematics
+from apnpql_jax.tasks import make_task, task_names
+
+HAND = {"hand", "d435", "r1", "l1", "r_tip", "l_tip", "r_pad", "l_pad"}
+
+
+@pytest.mark.parametrize("name", task_names())
+def test_all_of_the_hand_throws_a_shadow(name):
+  scene = make_task(name).scene
+  found = shadows_of_the_hand(scene, Geoms.from_model(scene.model))
+  assert {scene.model.geom(i).name for i in found["shadow_casters"]} == HAND
+  assert scene.model.geom("table").id in found["shadow_receivers"]
+
+
+def test_the_shadow_is_seen_on_the_table_and_on_flat_marks_alone(task, resets):
+  scene = task.scene
+  poses = jax.jit(make_kinematics(scene), compiler_options=testing.FAST_COMPILE)(resets)
+  plain, shaded = (
+    np.asarray(make_cameras(EnvConfig(shadows=shadows), scene)[0](poses), np.int32)
+    for shadows in (False, True)
+  )
+  camera = CameraSpec.from_model(scene.model, "global", height=72, width=96)
+  seen = render(
+    Geoms.from_model(scene.model),
+    camera,
+    poses.geom_xpos,
+    poses.geom_xmat,
+    poses.cam_xpos[:, camera.id],
+    poses.cam_xmat[:, camera.id],
+    outputs=("segmentation",),
+  ).segmentation
+  dark = (plain != shaded).any(-1)
+  flat = [scene.model.geom(name).id for name in ("table", "goal")]
+  assert np.isin(seen, flat)[dark].all()
+  assert (dark.sum((1, 2)) > 20).mean() > 0.5
+  left = 1.0 - Lighting().shadow
+  np.testing.assert_allclose(shaded[dark], left * plain[dark], atol=1.5)

@@ -1,0 +1,199 @@
+"""The batch of worlds: reset, step, time limit, automatic reset, observations."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from apnpql_jax.agents.learner import make_agent
+from apnpql_jax.config.schema import AgentConfig, EnvConfig
+from apnpql_jax.data import replay
+from apnpql_jax.envs.env import Env, make_env
+from apnpql_jax.sim import arm
+from apnpql_jax.training import evaluate
+from apnpql_jax.training.evaluate import play_held_out
+from apnpql_jax.training.expert import example_slot
+from apnpql_jax.training.rollout import (
+  FILMED,
+  agent_policy,
+  expert_policy,
+  make_player,
+  rollout,
+)
+from apnpql_jax.types import Observation
+
+CONFIG = EnvConfig(obs="state", backend="native", worlds=16, bank_rows=256)
+SHORT = dataclasses.replace(CONFIG, time_limit_s=0.45)
+
+
+@pytest.fixture(scope="module")
+def env() -> Env:
+  return make_env(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def pixel_chunk(env):
+  """Twelve periods of the expert in four worlds, seen by both cameras."""
+  pixels = Env(dataclasses.replace(CONFIG, obs="pixels"), env.task, env._bank)
+  play = jax.jit(
+    lambda start, key: rollout(
+      pixels, expert_policy(pixels, noise=0.0), start, key, length=12
+    )
+  )
+  return play(pixels.reset(jnp.arange(4)), jax.random.key(0))[1]
+
+
+def test_held_out_rows_are_never_trained_on(env):
+  assert env.bank_split == 192 and env.held_out == 64
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.0])
+def test_density_of_the_expert_is_that_of_its_noise(env, noise: float):
+  """Without noise it is so high that no other policy comes near."""
+  state = env.reset(jnp.arange(16))
+  action, log_prob = expert_policy(env, noise=noise)(state, jax.random.key(0))
+  mean = env.expert_action(state)[..., :6]
+  expected = stats.norm.logpdf(action[..., :6], mean, max(noise, 1e-6)).sum(-1)
+  np.testing.assert_allclose(log_prob, expected, rtol=1e-3)
+  assert np.all(np.asarray(log_prob) > 60.0) == (noise == 0.0)
+
+
+def test_time_out_truncates_then_resets(env):
+  """Three periods, then a terminal instant, then the first instant of a new episode."""
+  short = Env(SHORT, env.task, env._bank)
+  assert SHORT.episode_steps == 3
+  play = jax.jit(
+    lambda start, key: rollout(
+      short, expert_policy(short, noise=0.0), start, key, length=9
+    )
+  )
+  _, chunk = play(short.reset(jnp.arange(16)), jax.random.key(0))
+  step = chunk.timestep
+  expected = np.array([0, 0, 0, 1, 0, 0, 0, 1, 0], bool)
+  np.testing.assert_array_equal(step.truncated, np.tile(expected[:, None], (1, 16)))
+  assert not step.terminated.any() and not step.reward.any()
+  robot = np.asarray(step.observation.robot)
+  # A new episode starts with three equal robot states, from another row.
+  np.testing.assert_array_equal(robot[4, :, :7], robot[4, :, 14:])
+  assert (np.abs(robot[4] - robot[0]).max(-1) > 1e-3).mean() > 0.8
+  # Within an episode the stack shifts by one state per period.
+  np.testing.assert_array_equal(robot[1, :, 7:14], robot[0, :, 14:])
+
+
+def test_an_lstm_is_shown_by_the_replay_what_it_acted_on(env):
+  """Three instants at a time, of episodes that have four."""
+  short = Env(SHORT, env.task, env._bank, instants=3)
+
+  def velocity(seen: Observation) -> jax.Array:
+    """f32[b] for one joint: another one for other observations, or another order."""
+    whole = jnp.concatenate([x.reshape(len(x), -1) for x in jax.tree.leaves(seen)], 1)
+    weights = jax.random.normal(jax.random.key(0), whole.shape[1:])
+    return jnp.tanh(whole @ weights / 10.0)
+
+  def act(params, seen: Observation, key, greedy):
+    action = jnp.full((16, 7), 0.5).at[:, 0].set(velocity(seen))
+    return action, {"log_prob": jnp.zeros(16)}
+
+  agent = dataclasses.replace(make_agent(AgentConfig()), act=act)
+  policy = agent_policy(agent, {}, greedy=False)
+
+  @jax.jit
+  def play(key):
+    start = short.reset(jnp.arange(16))
+    _, chunk = rollout(short, policy, start, key, length=10)
+    ring = replay.add(replay.create(example_slot(start), 10, 16), chunk)
+    return replay.sample(ring, key, batch_size=256, n_step=2, gamma=0.9, instants=3)
+
+  batch = play(jax.random.key(0))
+  seen = batch.observation_tm1
+  np.testing.assert_allclose(velocity(seen), batch.action_tm1[:, 0], atol=1e-4)
+  # Drawn at the first instant of an episode, the second, and the third.
+  moves = np.any(seen.robot[:, 1:, -7:] != seen.robot[:, :-1, -7:], axis=-1)
+  kinds = np.unique(moves, axis=0)
+  np.testing.assert_array_equal(kinds, [[0, 0], [0, 1], [1, 1]])
+
+
+@pytest.fixture(scope="module")
+def play(env):
+  """Plays the expert; the parameter of its policy is its noise."""
+  return make_player(env, lambda noise: expert_policy(env, noise=noise))
+
+
+def test_evaluation_is_repeatable(env, play):
+  first, again, other = (
+    play_held_out(env, play, 0.3, episodes=16, seed=seed) for seed in (5, 5, 6)
+  )
+  same = jax.tree.map(np.array_equal, first, again)
+  assert all(jax.tree.leaves(same))
+  assert not np.array_equal(first.length, other.length)
+
+
+def test_many_episodes_are_played_in_turns_each_row_once_before_any_is_repeated(
+  env, play, monkeypatch
+):
+  monkeypatch.setattr(evaluate, "MAX_WORLDS", 16)
+  played = play_held_out(env, play, 0.0, episodes=93, seed=5)  # The last turn is short.
+  assert len(played.success) == len(played.length) == 93
+  rows = (env.bank_split + np.arange(env.held_out)).reshape(-1, 16)
+  in_order = [play(0.0, jnp.asarray(turn), jax.random.key(9)) for turn in rows]
+  for field in ("success", "length"):
+    each = np.concatenate([getattr(episodes, field) for episodes in in_order])
+    found = getattr(played, field)[: env.held_out]
+    np.testing.assert_array_equal(np.sort(found), np.sort(each))
+
+
+def test_an_episode_is_what_steps_from_a_reset_make(env, play):
+  """The player judges and observes at the head of its loop, resets and steps alike."""
+  rows = env.bank_split + jnp.arange(16)
+  episodes = play(0.0, rows, jax.random.key(0))
+  length = env.config.episode_steps + 1
+
+  @jax.jit
+  def stepped(start, key):
+    policy = expert_policy(env, noise=0.0)
+    return rollout(env, policy, start, key, length=length)[1].timestep
+
+  timestep = stepped(env.reset(rows), jax.random.key(1))
+  last = np.asarray(timestep.last).argmax(0)
+  np.testing.assert_array_equal(episodes.length, last)
+  np.testing.assert_array_equal(
+    episodes.success, timestep.terminated[last, np.arange(16)]
+  )
+  joints = episodes.states.qpos[..., env.task.scene.arm_qpos]
+  assert joints.shape[:2] == (length, FILMED)
+  for i in range(FILMED):
+    instants = slice(last[i] + 1)
+    expected = timestep.observation.robot[instants, i, -7:-1]
+    np.testing.assert_allclose(joints[instants, i], expected, atol=1e-3)
+
+
+def test_tool_is_where_the_joints_put_it(env):
+  state = env.reset(jnp.arange(16))
+  observation = state.timestep.observation
+  position, _, _ = arm.forward(
+    arm.make_chain(env.task.scene), observation.robot[:, -7:-1]
+  )
+  np.testing.assert_allclose(observation.tool, position, atol=1e-5)
+
+
+def test_pixels_show_the_task(env, pixel_chunk):
+  """Plate, goal and gripper are in the images in their colors, at the right size."""
+  observation = pixel_chunk.timestep.observation
+  assert observation.global_image.shape == (12, 4, 72, 96, 3)
+  assert observation.wrist_image.shape == (12, 4, 36, 64, 3)
+  assert observation.global_image.dtype == observation.wrist_image.dtype == np.uint8
+  assert observation.objects is None
+  image = np.asarray(observation.global_image[0], int)
+  red, green, blue = np.moveaxis(image, -1, 0)
+  goal = (red > 1.8 * blue).sum((1, 2))
+  plate = (blue > 2.5 * red).sum((1, 2))
+  assert (goal > 80).all() and (goal < 800).all()
+  assert (plate > 40).all() and (plate < 400).all()
+  # What moves is seen to move.
+  moved = np.abs(image - np.asarray(observation.global_image[-1], int)).max(-1)
+  assert ((moved > 20).sum((1, 2)) > 30).all()

@@ -1,0 +1,120 @@
+"""Action primitives: targets against mink, and following them without overshoot."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from apnpql_jax.primitives import ik, reset_bank, tracking
+from apnpql_jax.sim import arm, physics
+from apnpql_jax.sim.kinematics import make_kinematics
+from apnpql_jax.tasks.stack_box import StackBox
+from apnpql_jax.tasks.task import ResetDraw
+
+
+@pytest.fixture(scope="module")
+def small_bank(task, tmp_path_factory):
+  """A bank built from nothing in an empty cache, and its report."""
+  with pytest.MonkeyPatch.context() as patch:
+    patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+    built = reset_bank.load_bank(task, 48)
+    again = reset_bank.load_bank(task, 48)
+  jax.tree.map(np.testing.assert_array_equal, built[0], again[0])
+  assert built[1] == again[1]
+  return built
+
+
+def test_bank_targets_reach_their_poses(task, small_bank):
+  """mink's targets, checked with C MuJoCo's kinematics of the whole scene."""
+  rows, report = small_bank
+  assert rows.rows == 48
+  assert report.max_position_residual < ik.POSITION_TOLERANCE
+  assert report.max_rotation_residual < ik.ROTATION_TOLERANCE
+  state = _at(task, rows)
+  positions, rotations, _ = task.tool_targets(
+    state, jax.jit(make_kinematics(task.scene))(state)
+  )
+  reached, turned, _ = arm.forward(arm.make_chain(task.scene), rows.targets)
+  np.testing.assert_allclose(reached, positions, atol=1e-3)
+  angle = np.linalg.norm(arm.rotation_error(turned, rotations), axis=-1)
+  assert angle.max() < ik.ROTATION_TOLERANCE
+
+
+class Careless(StackBox):
+  """A third of its draws have the boxes in each other, a third are out of reach."""
+
+  def sample_resets(self, rng: np.random.Generator, count: int) -> ResetDraw:
+    draw = super().sample_resets(rng, count)
+    (yellow, _), (blue, _) = map(self.scene.free_joint, ("yellow", "blue"))
+    place = draw.qpos[::3, blue : blue + 3] + [0.02, 0.0, 0.0]
+    draw.qpos[::3, yellow : yellow + 3] = place
+    draw.qpos[1::3, yellow] += 1.0
+    return draw
+
+
+def test_bank_rejects_what_overlaps_and_what_is_out_of_reach(capsys):
+  """Two rounds of 32 draws, of which 10 can be used in each."""
+  careless = Careless()
+  rows, report = reset_bank.build_bank(careless, 16)
+  assert (report.drawn, rows.rows) == (64, 16)
+  assert (report.rejected_restless, report.rejected_unreachable) == (22, 22)
+  boxes = [careless.scene.free_joint(name)[0] for name in ("yellow", "blue")]
+  spots = np.stack([rows.qpos[:, address : address + 3] for address in boxes])
+  assert (np.linalg.norm(spots[0] - spots[1], axis=-1) > 0.12).all()
+  assert (spots[..., 0] < 0.6).all()
+  said = " ".join(capsys.readouterr().err.split())
+  assert "64 drawn, 22 of them restless and 22 out of reach" in said
+
+
+def test_refinement_agrees_with_mink(task, small_bank):
+  """From targets of a scene 5 cm away, the in-jit steps find mink's solution."""
+  rows, _ = small_bank
+  chain, solver = arm.make_chain(task.scene), ik.IkSolver()
+  target = rows.targets[:, 0]
+  position, rotation, _ = arm.forward(chain, target)
+  shift = np.random.default_rng(0).uniform(-0.05, 0.05, position.shape)
+  moved = position + jnp.asarray(shift, jnp.float32)
+  refined = jax.jit(tracking.refine)(chain, target, target, moved, rotation)
+  for i in range(16):
+    exact = solver.solve(*(np.asarray(x[i]) for x in (target, moved, rotation)))
+    assert exact.reached
+    np.testing.assert_allclose(refined[i], exact.q, atol=2e-3)
+
+
+def test_following_scales_as_a_whole():
+  velocity = tracking.follow(jnp.array([2.0, -1.0, 0, 0, 0, 0]), jnp.zeros(6))
+  np.testing.assert_allclose(velocity, [1.0, -0.5, 0, 0, 0, 0], rtol=1e-6)
+  braking = tracking.follow(jnp.array([0.5, -0.25, 0, 0, 0, 0]), jnp.zeros(6))
+  speed = np.sqrt(2 * tracking.BRAKING * 0.5)
+  np.testing.assert_allclose(braking[:2], [speed, -speed / 2], rtol=1e-6)
+  near = tracking.follow(jnp.full(6, 0.01), jnp.zeros(6))
+  np.testing.assert_allclose(near, tracking.GAIN * 0.01, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["native", "mjx"])
+def test_following_reaches_a_target_without_overshoot(engines, resets, task, name):
+  """From anywhere near the workspace, at rest, to anywhere near it."""
+  scene, step = task.scene, engines[name]
+  worlds = resets.qpos.shape[0]
+  rng = np.random.default_rng(5)
+  neutral = task.scene.keyframe("neutral")[scene.arm_qpos]
+  spread = np.array([0.8, 0.3, 0.4, 0.6, 0.6, 1.2])
+  start, target = neutral + rng.uniform(-spread, spread, (2, worlds, 6))
+  state = resets.replace(qpos=resets.qpos.at[:, scene.arm_qpos].set(start))
+  target, close = jnp.asarray(target, jnp.float32), jnp.ones(worlds)
+  side = np.sign(target - start)
+  overshoot = 0.0
+  for _ in range(50):
+    q = state.qpos[:, scene.arm_qpos]
+    state = step(state, tracking.follow(target, q), close)
+    beyond = side * np.asarray(state.qpos[:, scene.arm_qpos] - target)
+    overshoot = max(overshoot, beyond.max())
+  assert overshoot < 0.02
+  np.testing.assert_allclose(state.qpos[:, scene.arm_qpos], target, atol=0.02)
+
+
+def _at(task, rows):
+  poses = rows.qpos, rows.mocap_pos, rows.mocap_quat
+  return physics.initial_state(task.scene, *poses, rows.variant)

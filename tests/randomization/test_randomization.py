@@ -1,0 +1,347 @@
+"""Worlds of their own: what is drawn, what follows, and what stays when it is off."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from apnpql_jax import testing
+from apnpql_jax.config.ranges import RandomizationConfig
+from apnpql_jax.config.schema import EnvConfig
+from apnpql_jax.envs.env import Env, make_env
+from apnpql_jax.randomization.draw import free_bodies
+from apnpql_jax.randomization.randomize import make_randomize
+from apnpql_jax.sim import arm, engines, physics
+from apnpql_jax.sim.kinematics import make_kinematics
+from apnpql_jax.tasks import make_task, task_names
+from apnpql_jax.training.rollout import FILMED, expert_policy, make_player, rollout
+
+WORLDS = 8
+ALL = RandomizationConfig()
+NONE = RandomizationConfig(
+  **{field.name: 0.0 for field in dataclasses.fields(RandomizationConfig)}
+)
+CONFIG = EnvConfig(obs="state", backend="native", bank_rows=256, time_limit_s=0.45)
+
+SIZES = {
+  "geom_size",
+  "geom_pos",
+  "geom_aabb",
+  "geom_rbound",
+  "body_ipos",
+  "body_inertia",
+  "body_invweight0",
+  "dof_M0",
+  "dof_invweight0",
+}
+CHANGES = {
+  "color": {"geom_rgba", "background"},
+  "texture": {"waves", "odd_rgb", "grain"},
+  "light_turn": {"light_dir"},
+  "light_level": {"light_ambient", "light_diffuse"},
+  "camera_shift": {"cam_pos"},
+  "camera_turn": {"cam_quat"},
+  "field_of_view": {"cam_fovy"},
+  "table_height": {"body_pos"},
+  "table_tilt": {"body_quat"},
+  "table_turn": {"body_quat"},
+  "size": SIZES,
+  "shape": SIZES,
+  "mass": {
+    "body_mass",
+    "body_subtreemass",
+    "body_inertia",
+    "body_invweight0",
+    "dof_M0",
+    "dof_invweight0",
+  },
+  "friction": {"pair_friction"},
+  "damping": {"dof_damping"},
+  "delay_s": {"control_delay"},
+  "gripper_speed": {"gripper_speed"},
+}
+
+
+def _states(task, worlds: int = WORLDS) -> physics.PhysicsState:
+  draw = task.sample_resets(np.random.default_rng(3), worlds)
+  return physics.initial_state(task.scene, *map(jnp.asarray, draw))
+
+
+def _randomized(task, config=ALL, *, seed: int = 0) -> physics.PhysicsState:
+  randomize = jax.jit(make_randomize(config, task.scene))
+  return randomize(_states(task), jax.random.split(jax.random.key(seed), WORLDS))
+
+
+@pytest.fixture(scope="module")
+def drawn(task) -> physics.PhysicsState:
+  return _randomized(task)
+
+
+def _kinematics(task):
+  return jax.jit(make_kinematics(task.scene), compiler_options=testing.FAST_COMPILE)
+
+
+def _bits(tree) -> list[bytes]:
+  return [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(tree)]
+
+
+def test_every_setting_is_tested():
+  assert set(CHANGES) == {f.name for f in dataclasses.fields(RandomizationConfig)}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_setting_changes_its_own_fields_only(task, name):
+  config = dataclasses.replace(NONE, **{name: getattr(ALL, name)})
+  before = _states(task)
+  after = jax.eval_shape(
+    make_randomize(config, task.scene), before, jax.random.split(jax.random.key(0), 8)
+  )
+  assert set(after.fields) - set(before.fields) == CHANGES[name]
+  assert (after.command is not None) == (name == "delay_s")
+  for field, value in after.fields.items():
+    assert not value.weak_type, field
+    if field not in physics.OWN_FIELDS:
+      assert value.shape[1:] == getattr(task.scene.model, field).shape, field
+
+
+def test_a_setting_does_not_change_what_the_others_draw(task, drawn):
+  fewer = _randomized(
+    task, dataclasses.replace(ALL, texture=0.0, mass=0.0, delay_s=0.0)
+  )
+  for field in ("geom_rgba", "cam_pos", "light_dir", "body_quat", "geom_size"):
+    np.testing.assert_array_equal(fewer.fields[field], drawn.fields[field])
+  assert "waves" not in fewer.fields and "body_mass" not in fewer.fields
+
+
+def test_what_is_drawn_fills_its_range_and_differs_between_worlds(task, drawn):
+  model, fields = task.scene.model, {k: np.asarray(v) for k, v in drawn.fields.items()}
+  body, table = model.body("plate").id, model.geom("table").id
+  plate = model.geom("plate_floor").id
+  ratios = {
+    "mass": fields["body_mass"][:, body] / model.body_mass[body],
+    "friction": fields["pair_friction"][:, 3, 0] / model.pair_friction[3, 0],
+    "gripper_speed": fields["gripper_speed"] / physics.GRIPPER_SPEED,
+    "field_of_view": fields["cam_fovy"][:, 0] / model.cam_fovy[0],
+    "color": 1 + fields["geom_rgba"][:, table, 1] - model.geom_rgba[table, 1],
+    "table_height": 1 + fields["body_pos"][:, 1, 2] - model.body_pos[1, 2],
+    "shape": np.divide(*fields["geom_size"][:, plate, 1::-1].T)
+    / np.divide(*model.geom_size[plate, 1::-1]),
+  }
+  for name, ratio in ratios.items():
+    assert np.abs(ratio - 1).max() <= getattr(ALL, name) * 1.001, name
+    assert np.ptp(ratio) > 0.5 * getattr(ALL, name), name
+    assert len(np.unique(ratio)) == WORLDS, name
+  delay = fields["control_delay"]
+  assert delay.min() >= 0 and 0 < delay.max() <= 6  # Steps of 5 ms in 30 ms.
+  light = fields["light_ambient"] + fields["light_diffuse"]
+  assert light.max() <= 1.0 + 1e-6
+
+
+def test_geoms_of_the_robot_change_their_color_together(task, drawn):
+  model = task.scene.model
+  change = np.asarray(drawn.fields["geom_rgba"])[0] - model.geom_rgba
+  arm_geoms = [model.geom(name).id for name in ("base", "forearm", "wrist_2")]
+  for geom in arm_geoms:
+    np.testing.assert_allclose(change[geom], change[arm_geoms[0]], atol=1e-6)
+  np.testing.assert_array_equal(change[:, 3], 0.0)
+
+
+@pytest.fixture(scope="module", params=task_names())
+def any_task(request):
+  """A task, and worlds of it."""
+  task = make_task(request.param)
+  return task, _randomized(task, seed=1)
+
+
+def _model(task, state: physics.PhysicsState, world: int) -> mujoco.MjModel:
+  """That of one world, without what MuJoCo derives."""
+  model = copy.copy(task.scene.model)
+  given = (
+    "body_mass body_inertia body_ipos body_pos body_quat geom_size geom_pos "
+    "dof_damping cam_pos cam_quat"
+  )
+  for field in given.split():
+    getattr(model, field)[:] = np.asarray(state.fields[field][world])
+  return model
+
+
+def _data(model: mujoco.MjModel, state: physics.PhysicsState, world: int):
+  """Poses of one world, by C MuJoCo."""
+  data = mujoco.MjData(model)
+  for name in ("qpos", "mocap_pos", "mocap_quat"):
+    getattr(data, name)[:] = np.asarray(getattr(state, name)[world])
+  mujoco.mj_kinematics(model, data)
+  mujoco.mj_camlight(model, data)
+  return data
+
+
+def test_derived_constants_are_those_of_mujoco(any_task):
+  task, state = any_task
+  derived = "body_subtreemass body_invweight0 dof_invweight0 dof_M0".split()
+  for world in range(2):
+    model = _model(task, state, world)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    for field in derived:
+      np.testing.assert_allclose(
+        state.fields[field][world], getattr(model, field), rtol=2e-4, err_msg=field
+      )
+
+
+def test_objects_of_any_size_and_shape_stand_on_the_table(any_task):
+  task, state = any_task
+  sizes = np.asarray(state.fields["geom_size"])
+  for world in range(WORLDS):
+    model = _model(task, state, world)
+    data, table = _data(model, state, world), model.geom("table").id
+    solid = np.union1d(model.pair_geom1, model.pair_geom2)
+    for body in np.flatnonzero(free_bodies(model)):
+      geoms = solid[model.geom_bodyid[solid] == body]
+      gaps = [mujoco.mj_geomDistance(model, data, table, g, 1.0, None) for g in geoms]
+      assert abs(min(gaps)) < 1e-5
+      assert np.ptp(sizes[:, geoms], axis=0).max() > 0.0003
+
+
+def test_what_is_seen_stands_where_c_mujoco_has_it(task, drawn):
+  """Cameras, robot and objects of randomized worlds."""
+  seen = _kinematics(task)(drawn)
+  for world in range(WORLDS):
+    data = _data(_model(task, drawn, world), drawn, world)
+    for name in ("geom_xpos", "cam_xpos", "site_xpos", "geom_xmat", "cam_xmat"):
+      expected = getattr(data, name)
+      found = np.asarray(getattr(seen, name)[world]).reshape(expected.shape)
+      np.testing.assert_allclose(found, expected, atol=1e-5, err_msg=name)
+  camera = np.asarray(seen.cam_xpos)[:, task.scene.id("camera", "global")]
+  assert np.ptp(camera, axis=0).min() > 0.5 * ALL.camera_shift
+
+
+def test_the_arm_stands_where_the_world_has_it(task, drawn):
+  kinematics = _kinematics(task)(drawn)
+  chain = arm.make_chain(task.scene)
+  joints = drawn.qpos[:, None, task.scene.arm_qpos]
+  moved = arm.with_base(chain, task.scene, drawn.fields)
+  position, rotation, _ = arm.forward(moved, joints)
+  site = task.scene.tool_site
+  np.testing.assert_allclose(position[:, 0], kinematics.site_xpos[:, site], atol=1e-5)
+  np.testing.assert_allclose(rotation[:, 0], kinematics.site_xmat[:, site], atol=1e-5)
+  own, _, _ = arm.forward(chain, joints)
+  assert np.linalg.norm(own - position, axis=-1).max() > 0.01
+
+
+def test_a_late_command_is_two_commands_one_after_the_other(task, drawn):
+  """Bit for bit what an engine does that is told so."""
+  former, command = (
+    jnp.asarray(np.random.default_rng(i).uniform(-1, 1, (WORLDS, 7)), jnp.float32)
+    for i in range(2)
+  )
+  former, command = (x.at[:, 6].set(x[:, 6] > 0) for x in (former, command))
+  state = drawn.replace(command=former)
+  engine = engines.make_physics("native", task.scene, substeps=10)
+  after = engine.step(state, command[:, :6], command[:, 6])
+  np.testing.assert_array_equal(after.command, command)
+  for world in range(WORLDS):
+    steps = int(drawn.fields["control_delay"][world])
+    one = jax.tree.map(lambda x: x[world : world + 1], drawn).replace(command=None)  # noqa: B023
+    for count, told in ((steps, former), (10 - steps, command)):
+      if count:
+        part = engines.make_physics("native", task.scene, substeps=count)
+        one = part.step(one, told[world, None, :6], told[world, None, 6])
+    np.testing.assert_allclose(one.qpos[0], after.qpos[world], atol=1e-6)
+
+
+def test_both_engines_move_the_same_worlds(task, drawn):
+  velocity = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (WORLDS, 6)), "f4")
+  close, moved = jnp.zeros(WORLDS), {}
+  # Off their limits, which the engines take differently.
+  fingers = slice(task.scene.gripper_qpos, task.scene.gripper_qpos + 4)
+  drawn = drawn.replace(qpos=drawn.qpos.at[:, fingers].set(0.6))
+  for name in ("native", "mjx"):
+    engine = engines.make_physics(name, task.scene, substeps=10)
+    step = jax.jit(engine.step, compiler_options=testing.FAST_COMPILE)
+    moved[name] = step(step(drawn, velocity, close), -velocity, close)
+  np.testing.assert_allclose(moved["native"].qpos, moved["mjx"].qpos, atol=2e-4)
+  plain = drawn.replace(fields={}, command=None)
+  engine = engines.make_physics("native", task.scene, substeps=10)
+  plain = engine.step(engine.step(plain, velocity, close), -velocity, close)
+  assert np.abs(plain.qpos - moved["native"].qpos).max() > 2e-3
+
+
+@pytest.fixture(scope="module")
+def plain_env() -> Env:
+  return make_env(CONFIG)
+
+
+def _episodes(env: Env):
+  """Two episodes of three periods and the first instants of a third."""
+  play = jax.jit(
+    lambda rows, key: rollout(
+      env, expert_policy(env, noise=0.1), env.reset(rows), key, length=9
+    ),
+    compiler_options=testing.FAST_COMPILE,
+  )
+  return play(jnp.arange(4), jax.random.key(0))
+
+
+def test_with_all_ranges_zero_it_is_as_if_it_were_not_there(plain_env):
+  plain = dataclasses.replace(
+    CONFIG, obs="pixels", global_size=(12, 16), wrist_size=(8, 12)
+  )
+  config = dataclasses.replace(plain, randomize=True, randomization=NONE)
+  off, zero = (
+    _episodes(Env(one, plain_env.task, plain_env._bank)) for one in (plain, config)
+  )
+  assert jax.tree.structure(off) == jax.tree.structure(zero)
+  assert _bits(off) == _bits(zero)
+
+
+def test_a_state_keeps_its_types(plain_env):
+  """So that one compilation serves every iteration, and a loop can play episodes."""
+  config = dataclasses.replace(CONFIG, obs="pixels", shadows=True, randomize=True)
+  env = Env(config, plain_env.task, plain_env._bank, instants=3)
+  play = make_player(env, lambda noise: expert_policy(env, noise=noise))
+  episodes = jax.eval_shape(play, 0.0, jnp.arange(4), jax.random.key(0))
+  assert episodes.states.command.shape == (config.episode_steps + 1, FILMED, 7)
+  start = jax.eval_shape(env.reset, jnp.arange(4))
+  after = jax.eval_shape(env.step, start, jnp.zeros((4, 7)), jax.random.key(0))
+  types = lambda x: (x.shape, x.dtype, x.weak_type)  # noqa: E731
+  assert jax.tree.map(types, start) == jax.tree.map(types, after)
+  assert not any(x.weak_type for x in jax.tree.leaves(start))
+
+
+def test_each_episode_has_a_world_of_its_own(plain_env):
+  env = Env(
+    dataclasses.replace(CONFIG, randomize=True), plain_env.task, plain_env._bank
+  )
+
+  @functools.partial(jax.jit, compiler_options=testing.FAST_COMPILE)
+  def play(rows, key):
+    def period(state, key):
+      action = env.expert_action(state)
+      return env.step(state, action, key), (state.physics.fields, state.timestep)
+
+    return jax.lax.scan(period, env.reset(rows), jax.random.split(key, 9))[1]
+
+  fields, timestep = play(jnp.arange(4), jax.random.key(0))
+  for name in ("body_mass", "geom_rgba", "gripper_speed", "cam_pos"):
+    value = np.asarray(fields[name]).reshape(9, 4, -1)
+    same = (value[1:] == value[:-1]).all(-1)
+    # The instants 0 to 3 are one episode, 4 to 7 the next.
+    np.testing.assert_array_equal(same[[0, 1, 2, 4, 5, 6]], True)
+    np.testing.assert_array_equal(same[[3, 7]], False)
+  again, _ = play(jnp.arange(4), jax.random.key(1))
+  assert _bits(jax.tree.map(lambda x: x[0], again)) == _bits(
+    jax.tree.map(lambda x: x[0], fields)
+  )
+  assert _bits(jax.tree.map(lambda x: x[4], again)) != _bits(
+    jax.tree.map(lambda x: x[4], fields)
+  )
+  # The robot reports where the tool is as if the table stood as in the scene file.
+  joints = timestep.observation.robot[..., -7:-1]
+  position, _, _ = arm.forward(arm.make_chain(env.task.scene), joints)
+  np.testing.assert_allclose(timestep.observation.tool, position, atol=1e-5)

@@ -1,0 +1,277 @@
+"""Metric files, the curve, the interval and the progress display."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+from pathlib import Path
+import pty
+import struct
+import sys
+
+from hypothesis import given, settings, strategies as st
+import imageio.v3 as iio
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+from tensorboardX.proto import event_pb2
+
+from apnpql_jax.errors import UserError
+from apnpql_jax.runs import metrics
+from apnpql_jax.runs.progress import TrainProgress
+from apnpql_jax.runs.sinks import check_sinks, make_sinks
+
+
+class Clock:
+  """A clock that a test moves by hand."""
+
+  def __init__(self):
+    self.now = 1000.0
+
+  def __call__(self) -> float:
+    return self.now
+
+
+def _jsonl(folder: Path) -> list[dict[str, float]]:
+  lines = (folder / "metrics.jsonl").read_text().splitlines()
+  return [json.loads(line) for line in lines]
+
+
+@pytest.mark.parametrize(
+  ("successes", "n", "low", "high"),
+  [
+    (81, 263, 0.2553, 0.3662),
+    (15, 148, 0.0624, 0.1605),
+    (0, 20, 0.0, 0.1611),
+    (1, 29, 0.0061, 0.1718),
+  ],
+)
+def test_wilson_interval_equals_the_published_one(successes, n, low, high):
+  """Newcombe (1998), Statistics in Medicine 17, table I, method 3."""
+  got = metrics.wilson_interval(successes, n)
+  np.testing.assert_allclose(got, (low, high), atol=5e-5)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.integers(1, 2000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
+def test_wilson_interval_covers_the_rate(pair: tuple[int, int]):
+  successes, n = pair
+  low, high = metrics.wilson_interval(successes, n)
+  assert 0.0 <= low <= successes / n <= high <= 1.0 and low < high
+
+
+def test_wilson_interval_needs_successes_within_the_episodes():
+  assert metrics.wilson_interval(0, 0) == (0.0, 1.0)
+  for successes, n in ((-1, 5), (6, 5), (1, 0)):
+    with pytest.raises(ValueError, match="must"):
+      metrics.wilson_interval(successes, n)
+
+
+def test_rows_are_on_disk_at_once(tmp_path: Path):
+  clock = Clock()
+  writer = metrics.MetricWriter(tmp_path, clock=clock)
+  clock.now += 2.5
+  values = {"loss": jnp.float32(0.25), "updates": np.int64(2**53), "flag": True}
+  writer.write(64, values)
+  row = {"step": 64, "time/wall_s": 2.5, "loss": 0.25, "updates": 2**53, "flag": 1}
+  assert _jsonl(tmp_path) == [row]
+  with pytest.raises((TypeError, ValueError)):
+    writer.write(65, {"vector": np.zeros(2)})
+  assert _jsonl(tmp_path) == [row]
+
+
+def test_values_that_are_not_finite_become_null(tmp_path: Path):
+  with metrics.MetricWriter(tmp_path) as writer:
+    writer.write(4, {"b": float("nan"), "c": float("inf")})
+  # Strict JSON: no NaN token, which most readers reject.
+  (row,) = _jsonl(tmp_path)
+  assert row["b"] is None and row["c"] is None
+  assert [path.name for path in tmp_path.iterdir()] == ["metrics.jsonl"]
+
+
+def test_a_resumed_run_appends_and_its_clock_continues(tmp_path: Path):
+  clock = Clock()
+  with metrics.MetricWriter(tmp_path, clock=clock) as writer:
+    for step in (10, 20, 30):
+      clock.now += 5
+      writer.write(step, {"a": float(step)})
+  with (tmp_path / "metrics.jsonl").open("a") as file:
+    file.write('{"step": 40, "a": 4')  # Killed in the middle of a line.
+  (tmp_path / "metrics.csv").write_text("step\n10\n")  # Earlier versions wrote one.
+  clock.now += 1000
+  with metrics.MetricWriter(tmp_path, resume_step=20, clock=clock) as writer:
+    clock.now += 3
+    writer.write(25, {"b": 1.0})
+  assert [row["step"] for row in _jsonl(tmp_path)] == [10, 20, 25]
+  assert [row["time/wall_s"] for row in _jsonl(tmp_path)] == [5.0, 10.0, 13.0]
+  assert (tmp_path / "metrics.csv").read_text() == "step\n10\n"
+
+
+def test_large_files_are_renamed_and_taken_back(tmp_path: Path):
+  with metrics.MetricWriter(tmp_path, max_bytes=300) as writer:
+    for step in range(1, 31):
+      writer.write(step, {metrics.SUCCESS: step / 30, "loss": 0.5})
+  files = metrics.metric_files(tmp_path)
+  names = [f"metrics.{n}.jsonl" for n in range(1, len(files))] + ["metrics.jsonl"]
+  assert [path.name for path in files] == names and len(files) > 3
+  assert all(path.stat().st_size < 400 for path in files)
+  steps = [row["step"] for path in files for row in metrics.read_rows(path)]
+  assert steps == list(range(1, 31))
+  assert [row["step"] for row in metrics.read_evaluations(tmp_path)] == steps
+  # A run that resumes within the second file drops those after it.
+  resume = metrics.read_rows(files[1])[0]["step"]
+  with metrics.MetricWriter(tmp_path, resume_step=int(resume or 0)) as writer:
+    writer.write(99, {"loss": 1.0})
+  left = {path.name for path in tmp_path.iterdir()}
+  assert left == {"metrics.jsonl", "metrics.1.jsonl"}
+  rows = metrics.read_rows(tmp_path / "metrics.jsonl")
+  assert [row["step"] for row in rows] == [resume, 99]
+
+
+def test_a_damaged_record_is_refused(tmp_path: Path):
+  path = tmp_path / "metrics.jsonl"
+  for text in ("oops\n", '{"a": 1}\n', "[1]\n", '{"step": "x"}\n'):
+    path.write_text('{"step": 1}\n' + text)
+    with pytest.raises(UserError, match=r"metrics.jsonl, line 2: not a row"):
+      metrics.MetricWriter(tmp_path)
+    assert path.read_text().endswith(text)
+
+
+def test_more_sinks_get_the_same_numbers(tmp_path: Path):
+  class Memory:
+    def __init__(self):
+      self.rows, self.closed = [], False
+
+    def write(self, step, row):
+      self.rows.append((step, dict(row)))
+
+    def close(self):
+      self.closed = True
+
+  sink = Memory()
+  with metrics.MetricWriter(tmp_path, sinks=[sink]) as writer:
+    writer.write(3, {"a": jnp.float32(0.5)})
+    assert not sink.closed
+  assert sink.rows == [(3, {"a": 0.5})] and sink.closed
+
+
+def test_tensorboard_holds_every_number(tmp_path: Path):
+  check_sinks(["tensorboard"])
+  (sink,) = make_sinks(["tensorboard"], tmp_path, {"seed": 0})
+  sink.write(3, {"a/b": 0.5, "c": -2.0})
+  sink.close()
+  (path,) = (tmp_path / "tensorboard").iterdir()
+  data, found, at = path.read_bytes(), [], 0
+  while at < len(data):  # Records of TFRecord: length, its check, event, its check.
+    (length,) = struct.unpack_from("<Q", data, at)
+    event = event_pb2.Event.FromString(data[at + 12 : at + 12 + length])
+    found += [(event.step, v.tag, v.simple_value) for v in event.summary.value]
+    at += 16 + length
+  assert found == [(3, "a/b", 0.5), (3, "c", -2.0)]
+
+
+def test_extras_that_are_unknown_or_missing_are_named(monkeypatch: pytest.MonkeyPatch):
+  with pytest.raises(UserError, match="choose from tensorboard, wandb"):
+    check_sinks(["tensorflow"])
+  for name, package, extra in (
+    ("tensorboard", "tensorboardX", "tb"),
+    ("wandb", "wandb", "wandb"),
+  ):
+    monkeypatch.delitem(sys.modules, package, raising=False)
+    monkeypatch.setattr(sys, "path", [])  # As if nothing were installed.
+    with pytest.raises(UserError, match=rf"{package}, .*apnpql-jax\[{extra}\]"):
+      check_sinks([name])
+  check_sinks([])
+
+
+def test_curve_shows_where_the_success_rate_is(tmp_path: Path):
+  path = tmp_path / "curve.png"
+  train_only: list[metrics.Row] = [{"step": 1, "loss": 2.0}]
+  assert not metrics.plot_curve(train_only, path) and not path.exists()
+
+  def drawn(rates: list[float]) -> np.ndarray:
+    rows: list[metrics.Row] = [
+      {"step": i, "time/wall_s": 60.0 * i, metrics.SUCCESS: r, metrics.EPISODES: 200}
+      for i, r in enumerate(rates)
+    ]
+    assert metrics.plot_curve([*train_only, *rows], path, title="push_plate")
+    return iio.imread(path)[..., :3].astype(int)
+
+  high, low = drawn([0.9, 0.9, 0.9]), drawn([0.1, 0.1, 0.1])
+  assert high.shape == low.shape and high.shape[0] > 200
+  # Blue ink, the curve and its band, lies in the upper half or in the lower one.
+  heights = []
+  for image in (high, low):
+    ink = (image[..., 2] - image[..., 0]) > 60
+    left, right = np.split(ink, [ink.shape[1] // 2], axis=1)
+    assert left.any() and right.any()
+    heights.append(np.nonzero(ink)[0].mean() / ink.shape[0])
+  assert heights[0] < 0.35 and heights[1] > 0.6
+  assert not list(tmp_path.glob("*.part"))
+
+
+def test_the_curve_band_is_the_wilson_interval():
+  row: metrics.Row = {"step": 1, metrics.SUCCESS: 0.85, metrics.EPISODES: 40}
+  expected = stats.binomtest(34, 40).proportion_ci(method="wilson")
+  np.testing.assert_allclose(metrics._interval(row), expected, rtol=1e-9)
+  assert metrics._interval({"step": 1, metrics.SUCCESS: 0.85}) == (0.85, 0.85)
+
+
+def test_progress_prints_plain_lines_where_there_is_no_terminal(capsys):
+  clock, stream = Clock(), io.StringIO()
+  with TrainProgress(1000, stream=stream, period_s=10, clock=clock) as progress:
+    clock.now += 100.0  # The first compilation.
+    progress.update(100, updates=7)
+    for i in range(1, 6):
+      clock.now += 4.0
+      progress.update(100 + 80 * i, updates=7 + 40 * i, success_rate=0.25)
+      progress.update(100 + 80 * i, updates=7 + 40 * i)
+    progress.message(f"checkpoint [1] written{'.' * 100}")
+  lines = stream.getvalue().splitlines()
+  assert lines[0] == "step 100 of 1,000 (10 %)  success --  -:--:-- left"
+  # 80 steps and 40 updates every 4 s; at 340, 660 steps are left.
+  figures = "success 25 %  20 steps/s  10.0 updates/s  0:00:33 left"
+  assert lines[1] == f"step 340 of 1,000 (34 %)  {figures}"
+  assert lines[2] == f"checkpoint [1] written{'.' * 100}"
+  assert lines[3].startswith("step 500 of 1,000 (50 %)") and len(lines) == 4
+  assert capsys.readouterr() == ("", "")
+
+
+def test_speeds_of_a_resumed_run_leave_out_what_came_before():
+  clock, stream = Clock(), io.StringIO()
+  with TrainProgress(10_000, stream=stream, period_s=0, clock=clock) as progress:
+    progress.update(5_000, updates=700)
+    clock.now += 60.0  # A slow iteration.
+    progress.update(5_120, updates=706)
+  figures = "success --  2 steps/s  0.1 updates/s  0:40:40 left"
+  assert stream.getvalue().splitlines()[1].endswith(figures)
+
+
+def test_progress_draws_a_bar_on_a_terminal():
+  controller, terminal = pty.openpty()
+  clock = Clock()
+  with os.fdopen(terminal, "w", encoding="utf-8") as stream:
+    with TrainProgress(1000, stream=stream, clock=clock) as progress:
+      progress.update(100, updates=20)
+      clock.now += 10.0
+      progress.update(500, updates=100, success_rate=0.5)
+      progress.message("a [bracketed] note")
+  shown = b""
+  with contextlib.suppress(OSError):  # Raised at the end, for the terminal is closed.
+    while part := os.read(controller, 2**16):
+      shown += part
+  os.close(controller)
+  shown = shown.decode()
+  assert "50%" in shown and "500 steps  success 50 %  40 steps/s" in shown
+  assert "0:00:13" in shown  # Left: 500 steps at 40 a second.
+  assert "a [bracketed] note" in shown and "\x1b[" in shown
+
+
+def test_progress_writes_to_standard_error_only(capsys):
+  with TrainProgress(10) as progress:
+    progress.update(5, updates=1)
+  out, err = capsys.readouterr()
+  assert out == "" and "step 5 of 10" in err

@@ -1,0 +1,133 @@
+"""Run folders on a real file system."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+import platform
+import subprocess
+import sys
+
+import jax
+import pytest
+
+from apnpql_jax.config.schema import EnvConfig, TrainConfig
+from apnpql_jax.errors import UserError
+from apnpql_jax.runs import run_folder, text, versions
+from apnpql_jax.runs.versions import changed_versions
+
+CONFIG = TrainConfig(env=EnvConfig(worlds=64), seed=3)
+
+
+def test_a_new_run_is_opened_with_the_same_configuration(tmp_path: Path):
+  made = run_folder.create(tmp_path / "deep" / "run", CONFIG)
+  opened = run_folder.open_run(tmp_path / "deep" / "run")
+  assert opened == made and opened.config == CONFIG
+  names = {path.name for path in made.path.iterdir()}
+  assert names == {"config.json", "versions.json"}
+
+
+def test_versions_tell_what_the_run_was_made_with(tmp_path: Path):
+  folder = run_folder.create(tmp_path / "run", CONFIG)
+  versions = json.loads(folder.versions.read_text())
+  assert versions["python"] == platform.python_version()
+  assert versions["packages"]["jax"] == jax.__version__
+  assert versions["device"]["backend"] == jax.default_backend()
+  assert versions["device"]["count"] == jax.device_count()
+
+
+def test_git_commit_is_that_of_the_package_and_of_nobody_else(tmp_path: Path):
+  def git(*args: str) -> str:
+    identity = ["-c", "user.name=t", "-c", "user.email=t@t"]
+    command = ["git", "-C", str(tmp_path), *identity, *args]
+    return subprocess.run(
+      command, check=True, capture_output=True, text=True
+    ).stdout.strip()
+
+  package = tmp_path / "package"
+  package.mkdir()
+  (package / "__init__.py").write_text("a = 1\n")
+  assert versions._git(package) is None
+  git("init", "-q")
+  # Installed inside a repository that does not track it.
+  git("commit", "-q", "--allow-empty", "-m", "other")
+  assert versions._git(package) is None
+  git("add", "package")
+  git("commit", "-q", "-m", "mine")
+  commit = git("rev-parse", "HEAD")
+  assert versions._git(package) == {"commit": commit, "dirty": False}
+  (package / "__init__.py").write_text("a = 2\n")
+  assert versions._git(package) == {"commit": commit, "dirty": True}
+
+
+def test_changed_versions_are_listed(tmp_path: Path):
+  folder = run_folder.create(tmp_path / "run", CONFIG)
+  assert changed_versions(folder.versions) == []
+  versions = json.loads(folder.versions.read_text())
+  versions["packages"]["jax"] = "0.0.1"
+  versions["created"] = "long ago"
+  folder.versions.write_text(json.dumps(versions))
+  assert changed_versions(folder.versions) == [f"jax 0.0.1 -> {jax.__version__}"]
+  folder.versions.write_text("{")
+  assert changed_versions(folder.versions) == ["versions.json cannot be read"]
+
+
+def test_a_run_is_replaced_only_when_asked(tmp_path: Path):
+  run = tmp_path / "run"
+  run_folder.create(run, CONFIG)
+  (run / "metrics.jsonl").write_text('{"step": 1}\n')
+  other = dataclasses.replace(CONFIG, seed=4)
+  with pytest.raises(UserError, match="holds a run") as error:
+    run_folder.create(run, other)
+  assert "\n" not in str(error.value)
+  assert run_folder.open_run(run).config == CONFIG and (run / "metrics.jsonl").exists()
+  run_folder.create(run, other, overwrite=True)
+  assert run_folder.open_run(run).config == other
+  assert not (run / "metrics.jsonl").exists()
+  assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_a_folder_that_is_no_run_is_never_removed(tmp_path: Path):
+  thesis = tmp_path / "thesis.txt"
+  thesis.write_text("years of work")
+  for overwrite in (False, True):
+    with pytest.raises(UserError, match="not a run"):
+      run_folder.create(tmp_path, CONFIG, overwrite=overwrite)
+  with pytest.raises(UserError, match="not a folder"):
+    run_folder.create(thesis, CONFIG, overwrite=True)
+  assert thesis.read_text() == "years of work"
+  empty = tmp_path / "empty"
+  empty.mkdir()
+  assert run_folder.create(empty, CONFIG).config == CONFIG
+
+
+def test_what_is_no_run_is_not_opened(tmp_path: Path):
+  for path in (tmp_path, tmp_path / "missing"):
+    with pytest.raises(UserError, match="not a run folder") as error:
+      run_folder.open_run(path)
+    assert "\n" not in str(error.value)
+  folder = run_folder.create(tmp_path / "run", CONFIG)
+  (folder.path / "config.json").write_text('{"seed": 1}')
+  with pytest.raises(UserError, match=r"config.json: .*missing"):
+    run_folder.open_run(folder.path)
+
+
+def test_a_text_file_is_written_whole_or_not_at_all(tmp_path: Path):
+  path = tmp_path / "a.json"
+  text.write_text(path, "old")
+  with pytest.raises(UnicodeEncodeError):
+    text.write_text(path, "new \ud800")
+  assert path.read_text() == "old"
+
+
+def test_the_command_line_loads_none_of_the_heavy_packages():
+  heavy = "jax orbax matplotlib rich flax mujoco numpy scipy".split()
+  code = (
+    "import sys, apnpql_jax.cli.main, apnpql_jax.runs.metrics,"
+    "apnpql_jax.runs.progress, apnpql_jax.runs.run_folder, apnpql_jax.runs.sinks;"
+    f"print([name for name in {heavy} if name in sys.modules])"
+  )
+  command = [sys.executable, "-c", code]
+  done = subprocess.run(command, check=True, capture_output=True, text=True)
+  assert done.stdout.strip() == "[]"

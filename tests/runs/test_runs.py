@@ -1,0 +1,171 @@
+"""Run folders: nothing is lost unless it was asked for."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+
+from apnpql_jax.config.files import config_to_json
+from apnpql_jax.config.schema import AgentConfig, TrainConfig
+from apnpql_jax.errors import ConfigError, UserError
+from apnpql_jax.runs import run_folder
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def write_run(folder: Path, config: TrainConfig | None = None) -> Path:
+  folder.mkdir(parents=True)
+  (folder / "config.json").write_text(config_to_json(config or TrainConfig()))
+  (folder / "curve.png").write_bytes(b"old")
+  return folder
+
+
+def test_new_run_dir_takes_the_first_free_number(tmp_path):
+  assert run_folder.new_run_dir("push_plate", tmp_path) == tmp_path / "push_plate-1"
+  (tmp_path / "push_plate-1").mkdir()
+  (tmp_path / "push_plate-3").mkdir()
+  assert run_folder.new_run_dir("push_plate", tmp_path) == tmp_path / "push_plate-2"
+
+
+def test_configuration_of_a_run_is_read_back(tmp_path):
+  config = TrainConfig(seed=3, agent=AgentConfig(gamma=0.9))
+  assert run_folder.load_run_config(write_run(tmp_path / "a", config)) == config
+
+
+def test_a_run_made_before_a_setting_came_is_read_and_that_is_said(tmp_path):
+  config = TrainConfig(seed=3, agent=AgentConfig(gamma=0.9))
+  run = write_run(tmp_path / "a", config)
+  data = json.loads((run / "config.json").read_text())
+  del data["agent"]["residual_blocks"]
+  (run / "config.json").write_text(json.dumps(data))
+  said: list[str] = []
+  assert run_folder.load_run_config(run, said.append) == config
+  assert said == [
+    f"{run}/config.json is older than some settings, which keep their old behavior: "
+    "agent.residual_blocks 0"
+  ]
+  # It is resumed as it was, and only so.
+  run_folder.check_resumable(run, config)
+  blocks = dataclasses.replace(config.agent, residual_blocks=1)
+  with pytest.raises(UserError, match="agent.residual_blocks 0 -> 1"):
+    run_folder.check_resumable(run, dataclasses.replace(config, agent=blocks))
+  del data["agent"]["n_step"]
+  (run / "config.json").write_text(json.dumps(data))
+  with pytest.raises(UserError, match="config.json: .*'agent.n_step' is missing"):
+    run_folder.load_run_config(run, pytest.fail)
+
+
+def test_configuration_that_is_not_text_is_refused(tmp_path):
+  write_run(tmp_path / "a")
+  (tmp_path / "a" / "config.json").write_bytes(b"\xff\xfe\x00")
+  with pytest.raises(UserError, match="config.json"):
+    run_folder.load_run_config(tmp_path / "a")
+
+
+def test_resume_may_change_only_what_does_not_alter_learning(tmp_path):
+  run = write_run(tmp_path / "a")
+  for name in run_folder.MAY_CHANGE:
+    value = getattr(TrainConfig(), name)
+    other = {bool: lambda x: not x, int: lambda x: x + 1, tuple: lambda x: (*x, "a")}
+    other = other[type(value)](value)
+    run_folder.check_resumable(run, dataclasses.replace(TrainConfig(), **{name: other}))
+  fixed = {f.name for f in dataclasses.fields(TrainConfig)} - set(run_folder.MAY_CHANGE)
+  for name in fixed - {"env", "agent", "replay"}:
+    changed = {name: getattr(TrainConfig(), name) + 1}
+    with pytest.raises(UserError, match=name):
+      run_folder.check_resumable(run, dataclasses.replace(TrainConfig(), **changed))
+
+
+def test_a_run_that_is_trained_is_left_alone(tmp_path):
+  run, other = write_run(tmp_path / "run"), write_run(tmp_path / "other")
+  with run_folder.lock(run), run_folder.lock(other):
+    for refused in (
+      lambda: run_folder.check_resumable(run, TrainConfig()),
+      lambda: run_folder.check_free(run, overwrite=True),
+      lambda: run_folder.lock(run).__enter__(),
+    ):
+      with pytest.raises(UserError, match="run' is trained by another process"):
+        refused()
+    run_folder.load_run_config(run)
+  run_folder.check_resumable(run, TrainConfig())
+  run_folder.check_free(run, overwrite=True)
+  # A process that is killed lets go of it.
+  code = "import sys, pathlib, time; from apnpql_jax.runs import run_folder\n"
+  code += (
+    "with run_folder.lock(pathlib.Path(sys.argv[1])): print(flush=True); time.sleep(60)"
+  )
+  command = [sys.executable, "-c", code, str(run)]
+  with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as process:
+    assert process.stdout is not None and process.stdout.readline()
+    with pytest.raises(UserError, match="another process"):
+      run_folder.check_free(run, overwrite=True)
+    process.kill()
+  run_folder.check_free(run, overwrite=True)
+
+
+def test_only_a_run_can_be_overwritten(tmp_path):
+  run_folder.check_free(tmp_path / "new", overwrite=False)
+  (tmp_path / "empty").mkdir()
+  run_folder.check_free(tmp_path / "empty", overwrite=False)
+  run = write_run(tmp_path / "run")
+  run_folder.check_free(run, overwrite=True)
+  with pytest.raises(UserError, match="--overwrite"):
+    run_folder.check_free(run, overwrite=False)
+  (tmp_path / "link").symlink_to(run, target_is_directory=True)
+  (run / "config.json").rename(tmp_path / "elsewhere.json")
+  for folder in (run, tmp_path, tmp_path / "link", tmp_path / "elsewhere.json"):
+    with pytest.raises(UserError):
+      run_folder.check_free(folder, overwrite=True)
+
+
+def test_fresh_folder_replaces_the_old_run(tmp_path):
+  run = write_run(tmp_path / "run")
+  with run_folder.fresh_run_dir(run) as folder:
+    assert folder == run
+    assert list(folder.iterdir()) == []
+    (folder / "config.json").write_text("new")
+  assert [path.name for path in tmp_path.iterdir()] == ["run"]
+  assert [path.name for path in run.iterdir()] == ["config.json"]
+
+
+@pytest.mark.parametrize("existed", [False, True])
+@pytest.mark.parametrize(
+  ("error", "begun"), [(ConfigError, False), (ConfigError, True), (RuntimeError, False)]
+)
+def test_refused_run_leaves_everything_as_it_was(tmp_path, error, begun, existed):
+  run = tmp_path / "run"
+  if existed:
+    write_run(run)
+  with pytest.raises(error), run_folder.fresh_run_dir(run) as folder:
+    (folder / "scene.bin").write_bytes(b"new")
+    if begun:
+      (folder / "config.json").write_text("new")
+    raise error("no such camera")
+  assert [path.name for path in tmp_path.iterdir()] == (["run"] if existed else [])
+  if existed:
+    assert (run / "curve.png").read_bytes() == b"old"
+    assert not (run / "scene.bin").exists()
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, SystemExit, RuntimeError])
+def test_stopped_run_is_kept_and_the_old_one_removed(tmp_path, stop):
+  run = write_run(tmp_path / "run")
+  with pytest.raises(stop), run_folder.fresh_run_dir(run) as folder:
+    (folder / "config.json").write_text("new")
+    raise stop()
+  assert [path.name for path in tmp_path.iterdir()] == ["run"]
+  assert (run / "config.json").read_text() == "new"
+
+
+def test_folder_that_cannot_be_made_is_refused(tmp_path):
+  (tmp_path / "file").write_text("")
+  with (
+    pytest.raises(UserError, match="cannot make run folder"),
+    run_folder.fresh_run_dir(tmp_path / "file" / "run"),
+  ):
+    pass

@@ -1,0 +1,110 @@
+"""What a signal does to a process whose main thread is in one long call."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from apnpql_jax.runs.signals import Signals
+
+BUSY = """
+import hashlib, sys
+from apnpql_jax.cli import main, options
+from apnpql_jax.runs.signals import Signals
+
+def busy(*_):
+  print("ready", flush=True)
+  hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)  # As deaf as a compilation.
+
+def train(*_):
+  with Signals("nothing is saved") as signals:
+    if sys.argv[1] == "training":
+      signals.finish_first("stopped at once")
+    busy()
+
+command = busy if sys.argv[1] == "listing" else train
+main._COMMANDS["list"] = (options.List, command, None)
+main.main(["list"])
+"""
+
+
+def _busy(phase: str) -> subprocess.Popen[str]:
+  process = subprocess.Popen(
+    [sys.executable, "-c", BUSY, phase],
+    cwd=Path(__file__).parents[2],
+    stdout=subprocess.PIPE,
+    stderr=subprocess.STDOUT,
+    text=True,
+  )
+  assert process.stdout is not None and process.stdout.readline() == "ready\n"
+  return process
+
+
+def _said(process: subprocess.Popen[str]) -> list[str]:
+  assert process.stdout is not None
+  return process.stdout.read().splitlines()
+
+
+@pytest.mark.parametrize(
+  ("phase", "number", "words"),
+  [
+    ("compiling", signal.SIGINT, "nothing is saved"),
+    ("compiling", signal.SIGTERM, "nothing is saved"),
+    ("listing", signal.SIGINT, "interrupted"),
+  ],
+)
+def test_with_nothing_to_save_the_first_signal_ends_the_process(phase, number, words):
+  with _busy(phase) as process:
+    process.send_signal(number)
+    assert process.wait(10) == 128 + number
+    assert _said(process) == [f"apnpql: {words}"]
+
+
+def test_a_second_signal_does_not_wait_but_one_sent_twice_is_one():
+  with _busy("training") as process:
+    process.send_signal(signal.SIGTERM)
+    time.sleep(0.1)
+    process.send_signal(signal.SIGTERM)  # As `timeout` does.
+    with pytest.raises(subprocess.TimeoutExpired):
+      process.wait(1.5)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(10) == 128 + signal.SIGINT
+    finishing, stopped = _said(process)
+    assert finishing.startswith("finishing this iteration")
+    assert stopped == "apnpql: stopped at once"
+
+
+STOPPED = """
+from apnpql_jax import errors
+from apnpql_jax.cli import main, options
+
+def stop(*_):
+  raise errors.RunStopped("no space left", errors.FAILED)
+
+main._COMMANDS["list"] = (options.List, stop, None)
+main.main(["list"])
+"""
+
+
+def test_the_exit_code_tells_even_where_no_line_can_be_written():
+  with open("/dev/full", "w") as full:  # As standard error on the disk that is full.
+    root = Path(__file__).parents[2]
+    command = [sys.executable, "-c", STOPPED]
+    done = subprocess.run(command, cwd=root, stderr=full, timeout=60)
+  assert done.returncode == 3
+
+
+def test_signals_are_collected_and_given_back(capfd):
+  before = signal.getsignal(signal.SIGTERM)
+  with Signals("") as signals:
+    signals.finish_first("")
+    os.kill(os.getpid(), signal.SIGTERM)
+    assert signals.caught == [signal.SIGTERM]
+  assert signal.getsignal(signal.SIGTERM) == before
+  assert signal.set_wakeup_fd(-1) == -1

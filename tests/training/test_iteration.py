@@ -1,0 +1,322 @@
+"""The iteration and the state it moves on: repeatable, saved whole, and safe from NaN.
+
+One compiled iteration serves all tests. Values that are not finite are put into real
+states; the slow variants do everything for other algorithms, engines and observations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import dataclasses
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from apnpql_jax import errors, testing
+from apnpql_jax.agents.learner import make_agent
+from apnpql_jax.agents.table_one import ALGORITHMS
+from apnpql_jax.cli import main
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.data import replay
+from apnpql_jax.envs.env import Env, make_env
+from apnpql_jax.errors import UserError
+from apnpql_jax.runs import checkpoint_reader, leaves, run_folder
+from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
+from apnpql_jax.training import faults, resume
+from apnpql_jax.training.expert import collect_expert, empty_expert
+from apnpql_jax.training.iteration import make_iteration, make_sample
+from apnpql_jax.training.state import TrainState, initial_state
+
+WORLDS, LENGTH = testing.TINY.env.worlds, testing.TINY.rollout_length
+
+
+class Built(NamedTuple):
+  """What is expensive to make."""
+
+  config: TrainConfig
+  env: Env
+  iteration: Callable  # compiled; donates its argument
+  state: TrainState  # after three iterations
+
+
+def _variants() -> list[Any]:
+  first, *others = ALGORITHMS
+  variants = [(first, "native", "pixels", 0), (first, "mjx", "state", 0)]
+  variants += [(name, "native", "state", 0) for name in others]
+  variants += [(first, "native", "pixels", 3), ("svg_prior", "native", "state", 3)]
+  slow = [
+    pytest.param(v, marks=pytest.mark.slow, id="-".join(map(str, v))) for v in variants
+  ]
+  return [pytest.param((first, "native", "state", 0), id=first), *slow]
+
+
+@pytest.fixture(scope="module", params=_variants())
+def built(request) -> Built:
+  algorithm, backend, obs, instants = request.param
+  agent = dataclasses.replace(
+    testing.TINY.agent, algorithm=algorithm, lstm_instants=instants
+  )
+  config = dataclasses.replace(
+    testing.TINY,
+    env=dataclasses.replace(testing.TINY.env, backend=backend, obs=obs),
+    agent=agent,
+    max_skipped_updates=2,
+  )
+  env, agent = make_env(config.env, instants=instants), make_agent(config.agent)
+  state = initial_state(config, env, agent, collect_expert)
+  assert all(x.committed for x in jax.tree.leaves(state))
+  jitted: Any = make_iteration(config, env, agent)
+  iteration = jitted.lower(state).compile(compiler_options=testing.FAST_COMPILE)
+  for _ in range(3):
+    state, metrics = iteration(state)
+  assert metrics["faults/worlds"] == metrics["faults/updates"] == 0
+  return Built(config, env, iteration, state)
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+  """C MuJoCo writes a log into the present folder when a world is not finite."""
+  monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def iteration(built):
+  """The iteration on a copy, which spares the original from being donated."""
+  return lambda state: built.iteration(jax.tree.map(jnp.copy, state))
+
+
+@pytest.fixture
+def state(built) -> TrainState:
+  return built.state
+
+
+def _bits(tree: Any) -> list[bytes]:
+  keys = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
+  plain = jax.tree.map(lambda x: jax.random.key_data(x) if keys(x) else x, tree)
+  return [np.asarray(x).tobytes() for x in jax.tree.leaves(plain)]
+
+
+def _break_world(state: TrainState, field: str, value: float) -> TrainState:
+  """World 1 with ``value`` in the first number of a field of its physics."""
+  broken = getattr(state.env.physics, field).at[1, 0].set(value)
+  physics = state.env.physics.replace(**{field: broken})
+  return state.replace(env=state.env.replace(physics=physics))
+
+
+def _poison_replay(state: TrainState) -> TrainState:
+  """Rewards of both replays that are not numbers."""
+
+  def poison(ring: replay.Replay) -> replay.Replay:
+    timestep = ring.slots.timestep
+    timestep = timestep.replace(reward=timestep.reward * jnp.nan)
+    return ring.replace(slots=ring.slots.replace(timestep=timestep))
+
+  assert state.expert_replay is not None
+  return state.replace(
+    replay=poison(state.replay), expert_replay=poison(state.expert_replay)
+  )
+
+
+def _poison_learner(state: TrainState) -> TrainState:
+  """Primitives so far off that the gradient of their loss is not a number."""
+  params = dict(state.learner.params)
+  params["ap"] = jax.tree.map(lambda x: x + jnp.inf, params["ap"])
+  return state.replace(learner=state.learner.replace(params=params))
+
+
+def test_the_state_keeps_its_types_so_that_one_compilation_serves_every_iteration(
+  built,
+):
+  agent = make_agent(built.config.agent)
+  start = jax.eval_shape(
+    lambda: initial_state(built.config, built.env, agent, empty_expert)
+  )
+  after, _ = jax.eval_shape(make_iteration(built.config, built.env, agent), start)
+
+  def types(state: TrainState) -> dict[str, tuple]:
+    named = leaves.named(state)
+    return {name: (x.shape, x.dtype, x.weak_type) for name, x in named.items()}
+
+  assert types(start) == types(after)
+
+
+def test_the_slow_average_of_the_weights_acts(iteration, state):
+  """Which worlds come about depends on it, and not on the weights that are trained."""
+
+  def worlds(**learner: Any) -> list[bytes]:
+    moved = state.replace(learner=state.learner.replace(**learner))
+    return _bits(iteration(moved)[0].env)
+
+  other = jax.tree.map(lambda x: x + 0.01, state.learner.params)
+  assert worlds(params=other) == worlds()
+  assert worlds(target_params=other) != worlds()
+
+
+def test_an_iteration_is_a_function_of_its_state(iteration, state):
+  first, again = iteration(state), iteration(state)
+  assert _bits(first) == _bits(again)
+  other = iteration(state.replace(key=jax.random.key(99)))
+  assert _bits(other[0].learner) != _bits(first[0].learner)
+
+
+def test_another_seed_is_another_run(built):
+  agent = make_agent(built.config.agent)
+  one, other = (
+    initial_state(
+      dataclasses.replace(built.config, seed=seed), built.env, agent, empty_expert
+    )
+    for seed in (0, 1)
+  )
+  for part in ("learner", "env", "key"):
+    assert _bits(getattr(one, part)) != _bits(getattr(other, part))
+
+
+def _save(run: Path, built: Built, *states: tuple[TrainState, bool]) -> None:
+  with CheckpointWriter(run, built.config, keep=9) as writer:
+    for state, whole in states:
+      writer.save(int(state.env_steps), resume.to_items(state, whole=whole))
+
+
+def test_a_state_that_was_saved_goes_on_bit_by_bit(built, iteration, tmp_path):
+  _save(tmp_path, built, (built.state, True))
+  example = jax.eval_shape(lambda: jax.tree.map(jnp.copy, built.state))
+  restored = resume.restore(built.config, tmp_path, example, pytest.fail)
+  straight = built.state
+  # Otherwise the first resume would compile the iteration again.
+  assert all(x.committed for x in jax.tree.leaves(restored))
+  assert _bits(restored) == _bits(straight) and len(_bits(straight)) > 60
+  for _ in range(2):
+    straight, told = iteration(straight)
+    restored, again = iteration(restored)
+  assert _bits(restored) == _bits(straight) and _bits(told) == _bits(again)
+
+
+def test_without_its_replay_a_state_goes_on_with_an_older_one(
+  built, iteration, tmp_path
+):
+  before, after = built.state, iteration(built.state)[0]
+  _save(tmp_path, built, (before, True), (after, False))
+  assert checkpoint_reader.all_steps(tmp_path) == [24, 32]
+  example = jax.eval_shape(lambda: jax.tree.map(jnp.copy, after))
+  said: list[str] = []
+  restored = resume.restore(built.config, tmp_path, example, said.append)
+  assert said == ["its replay is that of step 24"]
+  assert _bits(restored.replace(replay=None)) == _bits(after.replace(replay=None))
+  assert int(restored.replay.cursor) == int(before.replay.cursor)
+  # What is added next does not follow on the newest instant, which is now an end.
+  held, kept = (x.replay.slots.timestep.truncated for x in (restored, before))
+  newest = int(before.replay.cursor) - 1
+  assert held[newest].all() and not kept[newest].any()
+  np.testing.assert_array_equal(held[:newest], kept[:newest])
+  assert jnp.isfinite(iteration(restored)[1]["loss/q"])
+
+
+@pytest.mark.parametrize(
+  ("field", "value"),
+  [("qpos", np.nan), ("qvel", np.inf), ("qvel", 1e12), ("qacc_warmstart", np.nan)],
+)
+def test_a_broken_world_starts_again_and_its_episode_is_never_drawn(
+  built, iteration, state, field, value
+):
+  after, metrics = iteration(_break_world(state, field, value))
+  clean, _ = iteration(state)
+  assert metrics["faults/worlds"] == 1
+  np.testing.assert_array_equal(after.env.faults, [0, 1, 0, 0])
+  assert after.env.elapsed[1] < LENGTH
+  for leaf in jax.tree.leaves((after.env.physics, after.learner)):
+    assert jnp.isfinite(leaf).all()
+  # The instants of its episode, 3 iterations and this one, are all marked as ends.
+  cursor, length = int(after.replay.cursor), after.replay.slots.action.shape[0]
+  newest = (cursor - 1 - np.arange(4 * LENGTH)) % length
+  truncated = np.asarray(after.replay.slots.timestep.truncated)
+  assert truncated[newest, 1].all() and not truncated[newest][:, [0, 2, 3]].any()
+  # The other worlds are as they would have been.
+  others = np.array([0, 2, 3])
+  np.testing.assert_array_equal(
+    after.env.physics.qpos[others], clean.env.physics.qpos[others]
+  )
+  keys = jax.random.split(jax.random.key(0), 64)
+  sample = jax.jit(make_sample(built.config, make_agent(built.config.agent)))
+  for key in keys:
+    batch = sample(after.replay, after.expert_replay, key)
+    drawn = jax.tree.leaves((batch.observation_tm1, batch.observation_t))
+    assert all(jnp.isfinite(x).all() for x in drawn)
+    robot = np.asarray(after.replay.slots.timestep.observation.robot)[newest, 1]
+    # With an LSTM a start is a window of instants.
+    starts = np.asarray(batch.observation_tm1.robot)[batch.weight > 0]
+    starts = starts.reshape(-1, robot.shape[-1])
+    assert not (starts[:, None, :] == robot[None]).all(-1).any()
+
+
+def test_a_world_that_breaks_in_its_first_period_is_found(built, iteration, state):
+  """C MuJoCo starts such a world over; its clock must not look like a first period."""
+  fresh = built.env.reset(jnp.arange(WORLDS))
+  poisoned = _break_world(state.replace(env=fresh), "qvel", 1e12)
+  after, metrics = iteration(poisoned)
+  assert metrics["faults/worlds"] == 1
+  np.testing.assert_array_equal(after.env.faults, [0, 1, 0, 0])
+
+
+def test_the_native_engine_alone_would_not_have_told(built, state):
+  """C MuJoCo goes on from its default pose, finite; an action it takes for none."""
+  if built.env.physics.name != "native":
+    pytest.skip("MJX goes on with what is not a number")
+  step, sound = built.env.physics.step, built.env._sound
+  action = jnp.zeros((WORLDS, 7))
+  broken = _break_world(state, "qpos", np.nan).env
+  moved = step(broken.physics, action[:, :6], action[:, 6])
+  assert jnp.isfinite(moved.qpos).all()
+  np.testing.assert_array_equal(sound(broken, action, moved), [True, False, True, True])
+  action = action.at[2, 3].set(jnp.nan)
+  moved = step(state.env.physics, action[:, :6], action[:, 6])
+  assert jnp.isfinite(moved.qpos).all()
+  sound = sound(state.env, action, moved)
+  np.testing.assert_array_equal(sound, [True, True, False, True])
+
+
+@pytest.mark.parametrize("poison", [_poison_replay, _poison_learner])
+def test_an_update_that_is_not_finite_is_skipped_and_counted(iteration, state, poison):
+  poisoned = poison(state)
+  after, metrics = iteration(poisoned)
+  assert metrics["faults/updates"] == metrics["faults/updates_in_a_row"] == 2
+  assert _bits(after.learner) == _bits(poisoned.learner)
+  assert jnp.isnan(metrics["loss/q"])  # There was no update whose loss it could be.
+  healed, metrics = iteration(
+    after.replace(
+      replay=state.replay, expert_replay=state.expert_replay, learner=state.learner
+    )
+  )
+  assert metrics["faults/updates"] == metrics["faults/updates_in_a_row"] == 0
+  assert int(healed.learner.step) == int(state.learner.step) + 2
+  assert jnp.isfinite(metrics["loss/q"])
+
+
+def test_after_several_the_run_stops_and_the_update_can_be_repeated(
+  built, iteration, state, tmp_path: Path, capsys
+):
+  folder = run_folder.create(tmp_path / "run", built.config)
+  faults.check(built.config, state, folder)
+  assert not folder.faults.exists()
+  after, _ = iteration(_poison_replay(state))
+  with pytest.raises(errors.RunStopped, match="2 updates in a row") as stop:
+    faults.check(built.config, after, folder)
+  assert stop.value.code == errors.FAILED
+  (file,) = folder.faults.iterdir()
+  # The message ends with a command line that works as it stands.
+  command = str(stop.value).rpartition("apnpql ")[2].split()
+  capsys.readouterr()
+  assert main.main(command) == 0
+  told = capsys.readouterr().out.splitlines()
+  assert [line.split()[0] for line in told if "reward_t" in line] == ["batch"]
+  # With rewards of zero, those of windows too, the very same update is finite.
+  arrays: dict[str, Any] = dict(np.load(file, allow_pickle=False))
+  zeros = {k: np.zeros_like(x) for k, x in arrays.items() if "/reward" in k}
+  np.savez(file, **(arrays | zeros))
+  assert not any(faults.repeat(file).values())
+  np.savez(file, **{k: v for k, v in arrays.items() if k != "key"})
+  with pytest.raises(UserError, match="no update of this run: 'key'"):
+    faults.repeat(file)

@@ -1,0 +1,124 @@
+"""A whole run, small but real: train, resume, evaluate, stop by a signal."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+from apnpql_jax.config.schema import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
+from apnpql_jax.errors import UserError
+from apnpql_jax.runs import checkpoint_reader, run_folder
+from apnpql_jax.training.evaluate import evaluate
+from apnpql_jax.training.train import train
+from apnpql_jax.training.video import HOLD
+
+CONFIG = TrainConfig(
+  env=EnvConfig(worlds=4, bank_rows=256, time_limit_s=1.5, backend="native"),
+  agent=AgentConfig(
+    hidden=(32, 32), feature_dim=32, target_samples=16, policy_samples=16
+  ),
+  replay=ReplayConfig(capacity=256, expert_steps=128, expert_share=0.5, batch_size=16),
+  total_steps=64,
+  rollout_length=4,
+  updates_per_iteration=2,
+  eval_every=32,
+  eval_episodes=4,
+  checkpoint_every=32,
+)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> tuple[Path, dict]:
+  """A run to its end, and what ``train`` returned."""
+  run_dir = tmp_path_factory.mktemp("runs") / "run"
+  return run_dir, train(CONFIG, run_dir, resume=False)
+
+
+def test_a_run_leaves_everything_behind(finished):
+  run_dir, summary = finished
+  assert summary["env_steps"] == 64 and summary["updates"] == 8
+  assert summary["episodes"] == 4
+  folder = run_folder.open_run(run_dir)
+  assert folder.config == CONFIG
+  versions = json.loads(folder.versions.read_text())
+  assert versions["packages"]["mujoco"] == "3.17.0"
+  rows = [json.loads(line) for line in folder.metrics_jsonl.read_text().splitlines()]
+  assert [row["step"] for row in rows if "loss/q" in row] == [16, 32, 48, 64]
+  assert [row["step"] for row in rows if "eval/success_rate" in row] == [32, 64]
+  losses = [row["loss/q"] for row in rows if "loss/q" in row]
+  assert np.isfinite(losses).all()
+  assert checkpoint_reader.all_steps(run_dir) == [32, 64]
+  assert iio.imread(folder.curve).shape[-1] in (3, 4)
+  (video,) = folder.videos.iterdir()
+  frames = iio.imread(video)
+  # Both cameras stand beside the larger view, and something moves.
+  assert frames.shape[0] > 10 and frames.shape[2] > 1.5 * frames.shape[1]
+  assert np.abs(frames[0].astype(int) - frames[8]).max() > 50
+
+
+def test_evaluate_reports_the_newest_checkpoint(finished, tmp_path):
+  run_dir, _ = finished
+  video = tmp_path / "videos" / "four.mp4"
+  figures = evaluate(run_dir, episodes=4, seed=3, greedy=True, video=video)
+  assert figures["checkpoint_step"] == 64
+  assert figures["episodes"] == 4 and figures["greedy"]
+  # All instants of all four, the last of each held.
+  frames = len(iio.imread(next(video.parent.iterdir())))
+  assert frames == 4 * (figures["mean_length"] + HOLD)
+  assert figures["backend"] == "native" and figures["algorithm"] == "ap_npql"
+  low, high = figures["ci95"]
+  assert 0 <= low <= figures["success_rate"] <= high <= 1
+
+
+def test_resume_goes_on(finished):
+  run_dir, _ = finished
+  longer = dataclasses.replace(CONFIG, total_steps=96, video=False)
+  summary = train(longer, run_dir, resume=True)
+  assert summary["env_steps"] == 96 and summary["updates"] == 12
+  rows = run_folder.open_run(run_dir).metrics_jsonl.read_text().splitlines()
+  steps = [json.loads(row)["step"] for row in rows if "loss/q" in row]
+  assert steps == [16, 32, 48, 64, 80, 96]
+
+
+def test_resume_refuses_other_settings(finished):
+  run_dir, _ = finished
+  other = dataclasses.replace(
+    CONFIG, agent=dataclasses.replace(CONFIG.agent, gamma=0.9)
+  )
+  with pytest.raises(UserError, match=r"agent\.gamma 0\.99 -> 0\.9"):
+    train(other, run_dir, resume=True)
+
+
+def test_ctrl_c_ends_the_run_with_a_checkpoint(tmp_path):
+  run_dir = tmp_path / "run"
+  command = [sys.executable, "-m", "apnpql_jax", "train", "push_plate"]
+  command += "--obs state --env.worlds 4 --env.bank-rows 256 --no-video".split()
+  command += "--replay.capacity 512 --replay.expert-steps 128".split()
+  command += "--total-steps 1000000 --eval-every 1000000".split()
+  command += "--checkpoint-every 1000000".split()
+  said = tmp_path / "said.txt"
+  with said.open("w") as file:
+    process = subprocess.Popen([*command, "--run", str(run_dir)], stderr=file)
+  try:
+    metrics = run_dir / "metrics.jsonl"
+    deadline = time.monotonic() + 300
+    while not (metrics.exists() and metrics.read_text()):
+      assert process.poll() is None and time.monotonic() < deadline
+      time.sleep(0.5)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=60) == 130
+  finally:
+    process.kill()
+  (step,) = checkpoint_reader.all_steps(run_dir)
+  rows = [json.loads(line) for line in metrics.read_text().splitlines()]
+  assert rows[-1]["step"] == step
+  assert f"saved at step {step}; to go on: --resume {run_dir}" in said.read_text()
