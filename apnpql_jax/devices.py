@@ -33,11 +33,8 @@ _barriers = itertools.count()
 def join(coordinator: str, processes: int | None, process: int | None) -> None:
   """Joins the processes of a run; must precede the start of JAX's backend.
 
-  Args:
-    coordinator: Address and port of the first process; "auto" to get all three values
-      from the batch system.
-    processes: Number of processes that share the run.
-    process: Index of this process, from 0.
+  ``coordinator`` is the address and port of the first process, or "auto" to get all
+  three values from the batch system.
 
   Raises:
     ConfigError: The processes cannot connect.
@@ -54,8 +51,7 @@ def join(coordinator: str, processes: int | None, process: int | None) -> None:
 def make_mesh(devices: int) -> Mesh | None:
   """Returns a one-dimensional mesh of the first devices, or None for a single one.
 
-  Args:
-    devices: Number of devices; 0 for all devices of all processes.
+  0 means all devices of all processes.
 
   Raises:
     ConfigError: There are fewer devices.
@@ -120,15 +116,10 @@ def barrier() -> None:
 
 
 def check_memory(needed: int, what: str, available: int | None = None) -> None:
-  """Checks that something fits into memory before it is allocated.
-
-  Args:
-    needed: Size in bytes.
-    what: Name of the thing in the message.
-    available: Free bytes; those of the device if None.
+  """Checks that ``needed`` bytes are available, by default on each device.
 
   Raises:
-    ConfigError: ``needed`` exceeds the free memory.
+    ConfigError: They are not; the message starts with ``what``.
   """
   free = available_memory() if available is None else available
   if free is not None and needed > free:

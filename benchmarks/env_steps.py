@@ -53,7 +53,7 @@ def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
   agent = make_agent(config.agent)
   worlds, length = config.env.worlds, config.rollout_length
   state = env.reset(jnp.arange(worlds) % env.bank_split)
-  params = jax.jit(agent.init)(jax.random.key(0), state.seen).params
+  params = jax.jit(agent.init)(jax.random.key(0), state.observation).params
   policies: dict[str, Callable[[Any], Policy]] = {
     "env": lambda params: parts.random_policy,
     "env_policy": functools.partial(agent_policy, agent, greedy=False),

@@ -1,4 +1,4 @@
-"""Turn a cup over and put it on a mark, from pixels: the agent of stack_box."""
+"""Preset: flip a cup and put it on a mark, from pixels, with the agent of stack_box."""
 
 from __future__ import annotations
 

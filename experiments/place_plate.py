@@ -1,4 +1,4 @@
-"""Put a plate from its holder into a box, from pixels: the agent of stack_box."""
+"""Preset: put a plate from its holder into a box, from pixels, as stack_box."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Push a plate to a mark, from pixels, on a 2-core CPU.
+"""Preset: push a plate to a mark, from pixels, on a 2-core CPU.
 
-What is not the paper's was found by experiment; `experiments/log.md` has the trials.
+Values that differ from the paper were found by experiment, see `experiments/log.md`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Put a plate into a box in randomized worlds (paper Sec. V-C).
+"""Preset: put a plate into a box in randomized worlds (paper Sec. V-C).
 
-The agent of place_plate, with larger images, as the paper has for its transfer to a
-real robot, and a shadow.
+The agent of place_plate with a shadow and the larger images that the paper uses for its
+transfer to a real robot.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ CONFIG = dataclasses.replace(
     global_size=(120, 160),
     wrist_size=(60, 107),
   ),
-  # Images of this size take 77 kB an instant.
+  # Images of this size take 77 kB per slot.
   replay=dataclasses.replace(_PLACE.replay, capacity=25_600, expert_steps=12_800),
   total_steps=204_800,
 )

@@ -1,6 +1,6 @@
-"""Stack the yellow box on the blue one, from pixels.
+"""Preset: stack the yellow box on the blue one, from pixels.
 
-What differs from push_plate a grasp asks for: `experiments/log.md` has the trials.
+Grasping needs the differences from push_plate, see `experiments/log.md`.
 """
 
 from __future__ import annotations

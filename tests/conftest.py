@@ -25,14 +25,16 @@ runtime.configure()
 
 @pytest.fixture(scope="session")
 def task() -> Task:
-  """The shipped push_plate task. The fixtures below are of a module's own, if it
-  has one, but for ``engines``."""
+  """Returns the push_plate task.
+
+  A module may override it; the fixtures below, except ``engines``, then use its task.
+  """
   return make_task("push_plate")
 
 
 @pytest.fixture(scope="session")
 def engines(task: Task) -> dict[str, Callable]:
-  """Engine name -> jitted control period over worlds; compiled once per shape."""
+  """Returns engine name -> jitted control period over worlds."""
   return {
     name: jax.jit(make_physics(name, task.scene, substeps=30).step)
     for name in ("native", "mjx")
@@ -41,25 +43,25 @@ def engines(task: Task) -> dict[str, Callable]:
 
 @pytest.fixture(scope="module")
 def resets(task: Task) -> physics.PhysicsState:
-  """``WORLDS`` initial states as the task draws them."""
+  """Returns ``WORLDS`` initial states drawn by the task."""
   return drawn(task, WORLDS)
 
 
 @pytest.fixture(scope="module")
 def draw(task: Task) -> ResetDraw:
-  """Many draws, for statistics."""
+  """Returns many draws, for statistics."""
   return task.sample_resets(np.random.default_rng(0), 4000)
 
 
 @pytest.fixture(scope="module")
 def kinematics(task: Task, resets: physics.PhysicsState) -> Kinematics:
-  """Of the initial states: the arm is high over the table."""
+  """Returns the kinematics of the initial states, with the arm high over the table."""
   return jax.jit(make_kinematics(task.scene))(resets)
 
 
 @pytest.fixture(scope="module")
 def neutral(task: Task) -> tuple[np.ndarray, np.ndarray]:
-  """Position and rotation of the tool at the keyframe."""
+  """Returns position and rotation of the tool at the keyframe."""
   return neutral_tool(task)
 
 
@@ -67,7 +69,10 @@ def neutral(task: Task) -> tuple[np.ndarray, np.ndarray]:
 def rest(
   request: pytest.FixtureRequest, task: Task
 ) -> Callable[[physics.PhysicsState], physics.PhysicsState]:
-  """1.2 s with the arm at rest and the hand open; C MuJoCo unless a test names MJX."""
+  """Returns a step of 1.2 s with the arm still and the hand open, on C MuJoCo.
+
+  Tests can request another engine by indirect parametrization.
+  """
   backend = getattr(request, "param", "native")
   engine = jax.jit(make_physics(backend, task.scene, substeps=240).step)
 

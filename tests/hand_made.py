@@ -1,5 +1,4 @@
-"""States made by hand, bodies, pads and tool put where a test wants them, and what
-tests ask of states that are drawn."""
+"""States with bodies, pads and tool in given poses, and checks of drawn states."""
 
 from __future__ import annotations
 
@@ -30,18 +29,20 @@ MOTIONS = [
   for dof, limit in enumerate([0.05] * 3 + [0.5] * 3)
   for sign, factor in ((1, 0.8), (1, 1.2), (-1, 1.2))
 ]
-"""Degree of freedom of a free body, its speed in m/s or rad/s, whether that is rest."""
+"""Degree of freedom of a free body, speed in m/s or rad/s, whether that is rest."""
 
 
 def drawn(task: Task, worlds: int, *, seed: int = 3) -> PhysicsState:
-  """Initial states as the task draws them."""
+  """Draws initial states of a task."""
   draw = task.sample_resets(np.random.default_rng(seed), worlds)
   return physics.initial_state(task.scene, *map(jnp.asarray, draw))
 
 
 def each_cup(task: Task, worlds: int) -> tuple[PhysicsState, np.ndarray]:
-  """Initial states of flip_cup with its shapes in turn, and half of the width and the
-  height of the cups, f64[worlds, 2], m."""
+  """Returns initial states of flip_cup with its shapes in turn.
+
+  Also half the width and half the height of the cups, f64[worlds, 2], m.
+  """
   draw = task.sample_resets(np.random.default_rng(0), worlds)
   variant = np.arange(worlds) % len(SHAPES)
   half = np.array(SHAPES)[variant, 1:] / [1, 2]
@@ -52,7 +53,7 @@ def each_cup(task: Task, worlds: int) -> tuple[PhysicsState, np.ndarray]:
 
 
 def neutral_tool(task: Task) -> tuple[np.ndarray, np.ndarray]:
-  """Position f64[3] and rotation f64[3, 3] at the keyframe, from C MuJoCo."""
+  """Returns the tool's position f64[3] and rotation f64[3, 3] at the keyframe."""
   data = mujoco.MjData(task.scene.model)
   mujoco.mj_resetDataKeyframe(task.scene.model, data, 0)
   mujoco.mj_kinematics(task.scene.model, data)
@@ -61,13 +62,13 @@ def neutral_tool(task: Task) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pos(task: Task, state: PhysicsState, body: str):
-  """f32[worlds, 3] of a free body."""
+  """Returns the positions f32[worlds, 3] of a free body."""
   address, _ = task.scene.free_joint(body)
   return state.qpos[:, address : address + 3]
 
 
 def rotation(task: Task, state: PhysicsState, body: str) -> Rotation:
-  """Of a free body, one per world."""
+  """Returns the rotations of a free body, one per world."""
   address, _ = task.scene.free_joint(body)
   quat = np.asarray(state.qpos[:, address + 3 : address + 7], np.float64)
   return Rotation.from_quat(quat, scalar_first=True)
@@ -76,7 +77,7 @@ def rotation(task: Task, state: PhysicsState, body: str) -> Rotation:
 def put(
   task: Task, state: PhysicsState, body: str, where=None, turn: Rotation | None = None
 ) -> PhysicsState:
-  """Moves a free body to ``where`` and gives it the rotation ``turn``, if stated."""
+  """Moves a free body to ``where`` and rotates it to ``turn``, if given."""
   address, _ = task.scene.free_joint(body)
   qpos = state.qpos
   if where is not None:
@@ -90,13 +91,13 @@ def put(
 def moving(
   task: Task, state: PhysicsState, body: str, dof: int, speed: float
 ) -> PhysicsState:
-  """Gives a free body a speed; see ``MOTIONS``."""
+  """Sets the speed of a free body; see ``MOTIONS``."""
   _, start = task.scene.free_joint(body)
   return state.replace(qvel=state.qvel.at[:, start + dof].set(speed))
 
 
 def with_gap(task: Task, state: PhysicsState, gap) -> PhysicsState:
-  """The pads are ``gap`` m apart: a number, or f64[worlds]."""
+  """Sets the gap between the pads, m: a number or f64[worlds]."""
   fingers = [task.scene.model.joint(f"finger_{x}") for x in ("r1", "r2", "l1", "l2")]
   address = np.array([finger.qposadr[0] for finger in fingers])
   angle = jnp.broadcast_to(finger_angle(gap), len(state.qpos))[:, None]
@@ -104,7 +105,7 @@ def with_gap(task: Task, state: PhysicsState, gap) -> PhysicsState:
 
 
 def tool_at(task: Task, kinematics: Kinematics, where, mat=None) -> Kinematics:
-  """The tool at ``where`` and, if stated, with the rotation ``mat``."""
+  """Moves the tool to ``where`` and rotates it to ``mat``, if given."""
   tool = task.scene.tool_site
   kinematics = kinematics.replace(site_xpos=kinematics.site_xpos.at[:, tool].set(where))
   if mat is None:
@@ -115,7 +116,7 @@ def tool_at(task: Task, kinematics: Kinematics, where, mat=None) -> Kinematics:
 def segmentation(
   scene: Scene, kinematics: Kinematics, size: tuple[int, int] = (72, 96)
 ) -> np.ndarray:
-  """Ids of the geoms that the camera over the table sees, i32[worlds, H, W]."""
+  """Renders the ids of the geoms in the global camera, i32[worlds, H, W]."""
   camera = scene.id("camera", "global")
   image = render(
     Geoms.from_model(scene.model),
@@ -131,7 +132,7 @@ def segmentation(
 
 
 def assert_uniform(values, low, high) -> None:
-  """Every column of ``values`` f64[n, ...] is uniform between ``low`` and ``high``."""
+  """Checks that every column of f64[n, ...] is uniform between ``low`` and ``high``."""
   share = (values - low) / (np.asarray(high) - low)
   assert share.min() >= 0 and share.max() <= 1
   for column in share.reshape(len(share), -1).T:
@@ -139,16 +140,16 @@ def assert_uniform(values, low, high) -> None:
 
 
 def assert_pairs_are_uniform(pairs, low, high, *, distance, least) -> None:
-  """Pairs f64[n, 4] are uniform where the spots of one are far enough apart.
+  """Checks that pairs are uniform among those whose spots are far enough apart.
 
-  Compared with pairs that are drawn here, as many as it takes.
+  The reference is drawn here by rejection.
 
   Args:
-    pairs: two spots each, in any coordinates.
-    low: of the coordinates of a spot.
-    high: of the same.
-    distance: pairs -> f64[n], how far apart their spots are.
-    least: how far they have to be.
+    pairs: f64[n, 4], two spots each, in any coordinates.
+    low: lower limits of the coordinates of a spot.
+    high: upper limits of the same.
+    distance: maps pairs to the distances f64[n] between their spots.
+    least: smallest distance allowed.
   """
   low, high = np.tile(np.stack([low, high]), 2)
   assert (pairs >= low - 1e-9).all() and (pairs <= high + 1e-9).all()
@@ -162,5 +163,5 @@ def assert_pairs_are_uniform(pairs, low, high, *, distance, least) -> None:
 
 
 def apart(pairs: np.ndarray) -> np.ndarray:
-  """Distances f64[n] between the spots x, y of pairs f64[n, 4]."""
+  """Returns the distances f64[n] between the spots x, y of pairs f64[n, 4]."""
   return np.linalg.norm(pairs[:, :2] - pairs[:, 2:], axis=-1)

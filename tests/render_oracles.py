@@ -1,8 +1,8 @@
-"""Two independent pictures of a scene: MuJoCo's rays and MuJoCo's rasteriser.
+"""Two independent images of a scene: by MuJoCo's rays and by MuJoCo's rasterizer.
 
-The rays need no graphics library. The rasteriser runs in a process of its own (this
-file is its script), because the choice of graphics library belongs to the first
-import of MuJoCo and a missing one may take the interpreter down.
+The rays need no graphics library. The rasterizer runs this file in a new process: the
+first import of MuJoCo fixes the graphics library, and a missing one can crash the
+interpreter.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 def get_state(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-  """f64[n]: all that the poses of bodies depend on."""
+  """Returns everything that the poses of bodies depend on, f64[n]."""
   state = np.zeros(mujoco.mj_stateSize(model, STATE))
   mujoco.mj_getState(model, data, state, STATE)
   return state
 
 
 def ray_directions(height: int, width: int, fovy_deg: float) -> np.ndarray:
-  """f64[H, W, 3]: unit rays through the pixel centers in the camera's frame."""
+  """Returns unit rays f64[H, W, 3] through the pixel centers in the camera's frame."""
   half = np.tan(np.radians(fovy_deg) / 2)
   out = np.zeros((height, width, 3))
   for row in range(height):
@@ -42,7 +42,7 @@ def ray_directions(height: int, width: int, fovy_deg: float) -> np.ndarray:
 def cast_rays(
   model: mujoco.MjModel, data: mujoco.MjData, name: str, height: int, width: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-  """Geom ids i32[H, W], depths f64[H, W] and world normals f64[H, W, 3] of a camera."""
+  """Returns geom ids i32[H, W], depths f64[H, W] and world normals f64[H, W, 3]."""
   camera = model.camera(name).id
   rays = ray_directions(height, width, model.cam_fovy[camera])
   rotation = data.cam_xmat[camera].reshape(3, 3)
@@ -54,7 +54,7 @@ def cast_rays(
     data,
     data.cam_xpos[camera],
     (rays.reshape(-1, 3) @ rotation.T).reshape(-1),
-    np.array([1, 1, 1, 0, 0, 0], np.uint8),  # groups that the rasteriser draws
+    np.array([1, 1, 1, 0, 0, 0], np.uint8),  # groups that the rasterizer draws
     True,
     -1,
     ids,
@@ -68,10 +68,10 @@ def cast_rays(
   return ids.reshape(shape), depth.reshape(shape), normal.reshape(*shape, 3)
 
 
-def rasterise(
+def rasterize(
   model: mujoco.MjModel, states: np.ndarray, name: str, height: int, width: int
 ) -> tuple[np.ndarray, np.ndarray]:
-  """Geom ids i32[n, H, W] and depths f32[n, H, W] by ``mujoco.Renderer``.
+  """Returns geom ids i32[n, H, W] and depths f32[n, H, W] by ``mujoco.Renderer``.
 
   Raises:
     LookupError: no graphics library can be loaded.
@@ -95,7 +95,7 @@ def _environment(library: str) -> dict[str, str]:
 
 @functools.lru_cache
 def _graphics_library() -> str | None:
-  """The first value of MUJOCO_GL with which MuJoCo can draw here."""
+  """Returns the first value of MUJOCO_GL with which MuJoCo can draw here."""
   probe = """
 import mujoco
 model = mujoco.MjModel.from_xml_string("<mujoco/>")
@@ -113,7 +113,7 @@ with mujoco.Renderer(model, 8, 8) as renderer:
 
 
 def available() -> tuple[str, ...]:
-  """Names of the oracles that work on this machine; "rays" always does."""
+  """Returns the oracles that work on this machine; "rays" always does."""
   return ("rays",) if _graphics_library() is None else ("rays", "rasteriser")
 
 
@@ -125,9 +125,9 @@ def look(
   height: int,
   width: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-  """Geom ids and depths [n, H, W] by the oracle of that name."""
+  """Returns geom ids and depths [n, H, W] by an oracle."""
   if oracle == "rasteriser":
-    return rasterise(model, states, name, height, width)
+    return rasterize(model, states, name, height, width)
   data, views = mujoco.MjData(model), []
   for state in states:
     mujoco.mj_setState(model, data, state, STATE)
@@ -138,10 +138,10 @@ def look(
 
 
 def _main(folder: Path) -> None:
-  """Renders what ``rasterise`` left in the folder."""
+  """Renders the inputs that ``rasterize`` wrote to the folder."""
   given = np.load(folder / "in.npz")
   model = mujoco.MjModel.from_binary_path(str(folder / "model.mjb"))
-  # Round enough that facets of spheres and cylinders stay below the tolerance.
+  # Facets of spheres and cylinders must be finer than the tolerance.
   model.vis.quality.numslices, model.vis.quality.numstacks = 128, 64
   model.vis.quality.offsamples = model.vis.quality.shadowsize = 0
   height, width = given["size"].tolist()

@@ -96,7 +96,7 @@ def test_every_room_has_its_step():
 
 
 def test_imports_lead_down_the_stair():
-  steps = {name: index for index, name in enumerate(STAIR)}
+  steps: dict[str, int] = {name: index for index, name in enumerate(STAIR)}
   upward = [
     f"{module} imports {known}"
     for module, imported in modules().items()

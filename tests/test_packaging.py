@@ -1,4 +1,4 @@
-"""The wheel and the lock files: what a user who installs the project gets."""
+"""The wheel and the lock files, as users install them."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory) -> Path:
-  """The wheel, built as an installer builds it, without the network."""
+  """Builds the wheel like an installer, without the network."""
   folder = tmp_path_factory.mktemp("wheel")
   return Path(next(WheelBuilder(str(ROOT)).build(directory=str(folder))))
 
 
 @pytest.fixture(scope="module")
 def installed(wheel, tmp_path_factory) -> Path:
-  """The wheel unpacked, as an installer leaves it."""
+  """Unpacks the wheel like an installer."""
   folder = tmp_path_factory.mktemp("site")
   with zipfile.ZipFile(wheel) as archive:
     archive.extractall(folder)
@@ -40,7 +40,7 @@ def installed(wheel, tmp_path_factory) -> Path:
 
 
 def python(site: Path, cwd: Path, *args: str) -> str:
-  """Standard output of Python in ``cwd`` with ``site`` before everything installed."""
+  """Returns the output of Python in ``cwd`` with ``site`` first on the path."""
   done = subprocess.run(
     [sys.executable, *args],
     cwd=cwd,
@@ -54,7 +54,7 @@ def python(site: Path, cwd: Path, *args: str) -> str:
 
 
 def locked(name: str) -> dict[str, str]:
-  """Normalized name -> version of a lock file."""
+  """Returns normalized name -> version of a lock file."""
   pairs = [line.split("==") for line in (ROOT / name).read_text().splitlines()]
   return {canonicalize_name(package): version for package, version in pairs}
 
@@ -102,7 +102,7 @@ def test_command_is_declared(installed):
   assert "apnpql = apnpql_jax.cli.main:main" in entry.read_text()
 
 
-@pytest.mark.parametrize("name", ["requirements.lock", "requirements-dev.lock"])
+@pytest.mark.parametrize("name", sorted(p.name for p in ROOT.glob("*.lock")))
 def test_lock_is_plain_names_and_versions(name):
   for line in (ROOT / name).read_text().splitlines():
     assert re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.]+", line), line
@@ -115,7 +115,7 @@ def test_lock_is_plain_names_and_versions(name):
     ("requirements-dev.lock", PROJECT["optional-dependencies"]["test"]),
   ],
 )
-def test_lock_satisfies_what_the_project_asks_for(lock, wanted):
+def test_lock_satisfies_the_requirements_of_the_project(lock, wanted):
   versions = locked("requirements.lock") | locked(lock)
   for requirement in map(Requirement, wanted):
     version = versions[canonicalize_name(requirement.name)]

@@ -1,4 +1,4 @@
-"""Process settings: what ``configure`` sets, and what an import leaves alone."""
+"""Process settings: those that ``configure`` makes, and that importing makes none."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CONFIGURE = "import apnpql_jax; apnpql_jax.configure()"
 
 
 def run(code: str, **env: str) -> str:
-  """Standard output of ``code`` in a process with none of the settings but ``env``."""
+  """Returns the output of ``code`` in a process that has only the settings ``env``."""
   base = {k: v for k, v in os.environ.items() if k not in NAMES}
   done = subprocess.run(
     [sys.executable, "-c", code],
@@ -37,17 +37,17 @@ def run(code: str, **env: str) -> str:
 
 
 def settings(before: str = "", **env: str) -> dict[str, str]:
-  """Environment after ``apnpql_jax.configure()`` in a process of its own."""
+  """Returns the environment after ``apnpql_jax.configure()`` in a new process."""
   report = f"{CONFIGURE}; print(json.dumps(dict(os.environ)))"
   return json.loads(run(f"import json, os\n{before}\n{report}", **env))
 
 
 def threads(env: dict[str, str], cores: int) -> int:
-  """Size of the pool XLA makes: the first variable set, else one per core."""
+  """Returns the size of XLA's thread pool: the first variable set, else the cores."""
   return int(env.get("PJRT_NPROC") or env.get("NPROC") or cores)
 
 
-def test_an_import_changes_no_variable_and_starts_no_backend():
+def test_import_changes_no_variable_and_starts_no_backend():
   code = (
     "import json, os, pkgutil; import jax, mujoco.mjx, flax, distrax, mink;"
     "import orbax.checkpoint, imageio, matplotlib; before = dict(os.environ);"
@@ -62,7 +62,7 @@ def test_an_import_changes_no_variable_and_starts_no_backend():
 
 
 @pytest.mark.parametrize(
-  ("given", "least"),
+  ("given", "minimum"),
   [
     ({}, 4),
     ({"NPROC": "2"}, 4),
@@ -73,12 +73,12 @@ def test_an_import_changes_no_variable_and_starts_no_backend():
     ({"JAX_NUM_CPU_DEVICES": "2"}, 8),
   ],
 )
-def test_pool_has_at_least_four_threads(given, least):
+def test_pool_has_at_least_four_threads_per_device(given, minimum):
   one_core = "os.sched_setaffinity(0, {0}) if hasattr(os, 'sched_setaffinity') else 0"
-  assert threads(settings(one_core, **given), cores=1) >= least
+  assert threads(settings(one_core, **given), cores=1) >= minimum
 
 
-def test_what_the_user_sets_is_kept(tmp_path):
+def test_settings_of_the_user_are_kept(tmp_path):
   given = {
     "JAX_COMPILATION_CACHE_DIR": str(tmp_path),
     "JAX_DEFAULT_MATMUL_PRECISION": "float32",
@@ -89,7 +89,7 @@ def test_what_the_user_sets_is_kept(tmp_path):
   assert {name: env[name] for name in given} == given
 
 
-def test_sums_stay_inside_xla_beside_what_the_user_asks_of_it():
+def test_sums_stay_inside_xla_next_to_flags_of_the_user():
   code = "print(jax.jit(lambda x: (x * x).sum(1)).lower(jax.numpy.ones((32, 64, 3)))"
   fused = [
     "ynn_fusion" in run(f"{start}; {code}.compile().as_text())", **flags)
@@ -102,14 +102,14 @@ def test_sums_stay_inside_xla_beside_what_the_user_asks_of_it():
   assert fused == [True, False, False]
 
 
-def test_an_xla_that_may_not_know_a_flag_is_not_given_it(monkeypatch):
+def test_an_untested_version_of_xla_gets_no_flag(monkeypatch):
   monkeypatch.delenv("XLA_FLAGS", raising=False)
   monkeypatch.setattr(runtime.metadata, "version", lambda _: "0.12.0")
   runtime.configure()
   assert "XLA_FLAGS" not in os.environ
 
 
-def test_cache_lies_in_the_cache_folder_of_the_user(tmp_path):
+def test_cache_is_in_the_cache_folder_of_the_user(tmp_path):
   env = settings(XDG_CACHE_HOME=str(tmp_path))
   assert env["JAX_COMPILATION_CACHE_DIR"] == str(tmp_path / "apnpql_jax" / "xla")
   env = settings(XDG_CACHE_HOME="relative", HOME=str(tmp_path))
@@ -122,7 +122,7 @@ def test_cache_lies_in_the_cache_folder_of_the_user(tmp_path):
   [f"{CONFIGURE}; import jax", f"import jax; {CONFIGURE}"],
   ids=["first", "after"],
 )
-def test_jax_takes_the_settings_whichever_is_imported_first(order, tmp_path):
+def test_jax_has_the_settings_whichever_is_imported_first(order, tmp_path):
   code = (
     f"{order}; c = jax.config;"
     "print(c.jax_compilation_cache_dir, c.jax_default_matmul_precision)"
@@ -131,7 +131,7 @@ def test_jax_takes_the_settings_whichever_is_imported_first(order, tmp_path):
   assert run(code, XDG_CACHE_HOME=str(tmp_path)).split() == [str(cache), "highest"]
 
 
-def test_quiet_warp_drops_its_two_lines_only(capsys):
+def test_quiet_warp_drops_only_its_two_lines(capsys):
   with runtime.quiet_warp():
     print("Failed to import warp: No module named 'warp'")
     print("something else")
@@ -139,7 +139,7 @@ def test_quiet_warp_drops_its_two_lines_only(capsys):
   assert capsys.readouterr().out == "something else\n"
 
 
-def test_quiet_warp_lets_errors_through(capsys):
+def test_quiet_warp_passes_errors_through(capsys):
   with pytest.raises(ImportError), runtime.quiet_warp():
     print("a hint")
     raise ImportError

@@ -26,12 +26,7 @@ Json = dict[str, Any]
 
 
 def base_config(args: Train) -> TrainConfig:
-  """Returns the settings that ``train`` starts from: those of the preset or the run.
-
-  Raises:
-    ConfigError: The options contradict each other or name no preset.
-    FileError: The run cannot be read.
-  """
+  """Returns the settings that ``train`` starts from: those of the preset or the run."""
   if args.resume is not None and (args.run is not None or args.overwrite):
     raise ConfigError("--resume names the run itself; leave out --run and --overwrite")
   if args.preset:
@@ -64,12 +59,9 @@ def train(args: Train) -> Json:
     memory_bytes=devices.available_memory(),
     devices=mesh.size if mesh else 1,
   )
+  resume = args.resume is not None
   summary = run_training(
-    config,
-    run_dir,
-    resume=args.resume is not None,
-    overwrite=args.overwrite,
-    mesh=mesh,
+    config, run_dir, resume=resume, overwrite=args.overwrite, mesh=mesh
   )
   return summary if devices.is_primary() else {}
 
@@ -165,14 +157,14 @@ def list_names(args: List) -> Json:
 
 def _with_shortcuts(args: Train) -> TrainConfig:
   """Returns the settings with --backend, --obs and --algorithm applied."""
-  config = args.config
-  env = {"backend": args.backend, "obs": args.obs}
-  env = {name: value for name, value in env.items() if value is not None}
-  config = dataclasses.replace(config, env=dataclasses.replace(config.env, **env))
-  if args.algorithm is None:
-    return config
-  agent = dataclasses.replace(config.agent, algorithm=args.algorithm)
-  return dataclasses.replace(config, agent=agent)
+
+  def updated(part: Any, **settings: str | None) -> Any:
+    given = {name: value for name, value in settings.items() if value is not None}
+    return dataclasses.replace(part, **given)
+
+  env = updated(args.config.env, backend=args.backend, obs=args.obs)
+  agent = updated(args.config.agent, algorithm=args.algorithm)
+  return dataclasses.replace(args.config, env=env, agent=agent)
 
 
 def _mesh(args: Train) -> Mesh | None:

@@ -12,17 +12,9 @@ import sys
 from typing import Any
 
 from apnpql_jax import errors, runtime
-from apnpql_jax.cli import commands
+from apnpql_jax.cli import commands, options
 from apnpql_jax.cli.commands import Json
-from apnpql_jax.cli.options import (
-  Collect,
-  Convert,
-  Evaluate,
-  List,
-  Repeat,
-  Train,
-  parse,
-)
+from apnpql_jax.cli.options import Train, parse
 from apnpql_jax.config import files
 from apnpql_jax.console import say
 from apnpql_jax.errors import ConfigError, UserError, check_name
@@ -49,11 +41,11 @@ def main(argv: Sequence[str] | None = None) -> int:
       return 0
     check_name("command", args[0], list(_COMMANDS))
     kind, command = _COMMANDS[args[0]]
-    options = _parse(kind, args)
-    with Signals("interrupted"), _json_only(options.json) as write:
-      result = command(options)
+    parsed = _parse(kind, args)
+    with Signals("interrupted"), _json_only(parsed.json) as write:
+      result = command(parsed)
       if result:  # Empty in all but the first of several processes.
-        write(_to_json(result) if options.json else _show(result))
+        write(_to_json(result) if parsed.json else _show(result))
     return 0
   except UserError as error:
     say(f"apnpql: {' '.join(str(error).split())}")
@@ -108,7 +100,7 @@ def _to_json(result: Json) -> str:
 
 
 def _plain(value: Any) -> Any:
-  """Returns ``value`` for JSON: arrays as lists, paths as text, NaN as null."""
+  """Converts a value for JSON: arrays to lists, paths to text, NaN to null."""
   if hasattr(value, "tolist"):  # NumPy and JAX arrays.
     value = value.tolist()
   if isinstance(value, dict):
@@ -146,9 +138,9 @@ def _help() -> str:
 
 _COMMANDS: dict[str, tuple[type[Any], Callable[[Any], Json]]] = {
   "train": (Train, commands.train),
-  "evaluate": (Evaluate, commands.evaluate),
-  "collect": (Collect, commands.collect),
-  "convert": (Convert, commands.convert),
-  "repeat": (Repeat, commands.repeat),
-  "list": (List, commands.list_names),
+  "evaluate": (options.Evaluate, commands.evaluate),
+  "collect": (options.Collect, commands.collect),
+  "convert": (options.Convert, commands.convert),
+  "repeat": (options.Repeat, commands.repeat),
+  "list": (options.List, commands.list_names),
 }

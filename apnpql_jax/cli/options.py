@@ -178,13 +178,7 @@ class List:
 
 
 def parse(kind: type[T], name: str, argv: Sequence[str], default: T | None = None) -> T:
-  """Parses the options of one command.
-
-  Args:
-    kind: One of the dataclasses above.
-    name: Command name, for help and errors.
-    argv: Arguments after the command name.
-    default: Defaults of the options; those of ``kind`` if None.
+  """Parses the options ``kind`` of command ``name`` on top of ``default``.
 
   Raises:
     ConfigError: An option is unknown, incomplete or unreadable; the message is tyro's

@@ -21,10 +21,7 @@ _FORMERLY = "formerly"
 def added(default: Any, *, before: Any = None) -> Any:
   """Returns a dataclass field that older texts may lack.
 
-  Args:
-    default: Default of the field.
-    before: Value that reproduces the behavior from before the field existed; the
-      default if None.
+  ``before`` is its value there, which reproduces the old behavior; ``default`` if None.
   """
   before = default if before is None else before
   return dataclasses.field(default=default, metadata={_BEFORE: before})
@@ -55,12 +52,9 @@ def ignore(line: str) -> None:
 
 
 def from_json(cls: type[T], text: str, warn: Callable[[str], None] = ignore) -> T:
-  """Parses the output of ``to_json``.
+  """Parses the output of ``to_json``, which may predate some ``added`` fields.
 
-  Args:
-    cls: Dataclass to build.
-    text: JSON, possibly written before some ``added`` fields existed.
-    warn: Called with one line that lists the fields the text lacks, if any.
+  Calls ``warn`` with one line that lists these fields, if any.
 
   Raises:
     ConfigError: The text is not JSON, or a key is unknown, missing or of the wrong

@@ -67,15 +67,10 @@ def config_to_json(config: TrainConfig) -> str:
 def config_from_json(
   text: str, warn: Callable[[str], None] = codec.ignore
 ) -> TrainConfig:
-  """Parses and validates the output of ``config_to_json``; executes nothing.
-
-  Args:
-    text: The configuration as JSON.
-    warn: Called with one line that lists the settings newer than the text, if any.
+  """Parses and validates the output of ``config_to_json``; see ``codec.from_json``.
 
   Raises:
-    ConfigError: The text is not JSON, a key is unknown, missing or of the wrong type,
-      or a setting is invalid.
+    ConfigError: The text cannot be parsed, or a setting is invalid.
   """
   config = codec.from_json(TrainConfig, text, warn)
   validate(config)

@@ -1,8 +1,7 @@
-"""Demonstration files: episodes of states and actions, checked before they are used.
+"""Demonstration files: episodes of states and actions, checked on reading.
 
-A file holds what cannot be computed, the states of the scene and the actions; images,
-rewards and labels are made from them as those of any world are. The format is in
-``docs/demonstrations.md``.
+A file holds the states of the scene and the actions. Images, rewards and labels are
+computed from them, as in any world. ``docs/demonstrations.md`` describes the format.
 """
 
 from __future__ import annotations
@@ -23,33 +22,36 @@ FORMAT = "apnpql-demonstrations"
 VERSION = 1
 
 _SLACK = 0.05
-"""rad; how far a joint may be beyond its limit, which MuJoCo keeps softly."""
+"""rad; tolerance beyond a joint limit, because MuJoCo's limits are soft."""
 
 
 class Demonstrations(NamedTuple):
-  """Instants of episodes, one episode after the other, one control period apart."""
+  """Episodes one after the other, in instants one control period apart."""
 
   qpos: np.ndarray  # f32[n, nq]
   qvel: np.ndarray  # f32[n, nv]
   mocap_pos: np.ndarray  # f32[n, nmocap, 3], m
   mocap_quat: np.ndarray  # f32[n, nmocap, 4]
-  variant: np.ndarray  # i32[n]: of the scene
-  action: np.ndarray  # f32[n, 7]; that of an episode's last instant is ignored
+  variant: np.ndarray  # i32[n]: variant of the scene
+  action: np.ndarray  # f32[n, 7]; ignored at the last instant of an episode
   first: np.ndarray  # bool[n]: an episode begins here
 
   @property
   def instants(self) -> int:
-    """How many there are."""
+    """Number of instants."""
     return len(self.first)
 
 
 def save(
   path: Path, demos: Demonstrations, *, task: str, control_period_s: float
 ) -> dict[str, Any]:
-  """Writes a demonstration file; returns its name and what it holds.
+  """Writes a demonstration file.
+
+  Returns:
+    the name of the file and the numbers of instants and demonstrations.
 
   Raises:
-    FileError: it cannot be written.
+    FileError: the file cannot be written.
   """
   arrays: dict[str, Any] = {
     "format": FORMAT,
@@ -59,7 +61,7 @@ def save(
     **demos._asdict(),
   }
   try:
-    with path.open("wb") as file:  # Given a name, NumPy would append to it.
+    with path.open("wb") as file:  # NumPy appends a suffix to file names.
       np.savez_compressed(file, **arrays)
   except OSError as error:
     raise FileError(f"cannot write {path}: {error}") from None
@@ -71,22 +73,24 @@ def load(path: Path, task: Task, control_period_s: float) -> Demonstrations:
   """Reads and checks a demonstration file.
 
   Raises:
-    FileError: it is no such file, of another version, task or control period, or
-      holds what the scene cannot be in; the message names it.
+    FileError: the file has another format, version, task or control period, or a state
+      that the scene rejects.
   """
   arrays = npz.read(path, limit=devices.host_memory() or 1 << 32)
   fields = Demonstrations._fields
   wanted = {"format", "version", "task", "control_period_s", *fields}
   if arrays.keys() != wanted:
     names = ", ".join(sorted(arrays.keys() ^ wanted))
-    raise FileError(f"{path} lacks or has in excess: {names}")
-  expected = (FORMAT, VERSION, task.name, control_period_s)
-  for name, value in zip(("format", "version", "task"), expected, strict=False):
+    raise FileError(f"{path} lacks arrays or has extra ones: {names}")
+  expected = {"format": FORMAT, "version": VERSION, "task": task.name}
+  for name, value in expected.items():
     if str(arrays[name]) != str(value):
-      raise FileError(f"{path} has {name} {_shown(arrays[name])}, not {value}")
+      raise FileError(f"{path} has {name} {_shorten(arrays[name])}, not {value}")
   period = arrays["control_period_s"]
-  if period.shape or period.dtype.kind != "f" or abs(period - expected[3]) > 1e-6:
-    raise FileError(f"{path} has control_period_s {_shown(period)}, not {expected[3]}")
+  if period.shape or period.dtype.kind != "f" or abs(period - control_period_s) > 1e-6:
+    raise FileError(
+      f"{path} has control_period_s {_shorten(period)}, not {control_period_s}"
+    )
   try:
     demos = Demonstrations(**{name: arrays[name] for name in fields})
     check(demos, task.scene)
@@ -96,10 +100,10 @@ def load(path: Path, task: Task, control_period_s: float) -> Demonstrations:
 
 
 def check(demos: Demonstrations, scene: Scene) -> None:
-  """Refuses what the scene cannot be in.
+  """Checks shapes and values against the scene.
 
   Raises:
-    FileError: names the array and the first instant that is wrong.
+    FileError: a value is invalid; the message names the array and the first instant.
   """
   model, n = scene.model, demos.first.size
   variants = min((len(v) for v in scene.variants.values()), default=1)
@@ -116,7 +120,7 @@ def check(demos: Demonstrations, scene: Scene) -> None:
     array = getattr(demos, name)
     if array.dtype.kind not in kinds or array.shape != shape:
       raise FileError(f"{name} is {array.dtype}{list(array.shape)}, not {list(shape)}")
-    _refuse(name, "is not finite", ~np.isfinite(array))
+    _reject(name, "is not finite", ~np.isfinite(array))
   if not n or not demos.first[0]:
     raise FileError("the first instant must begin an episode")
   addresses = model.jnt_qposadr[free_joints(model)]
@@ -124,23 +128,25 @@ def check(demos: Demonstrations, scene: Scene) -> None:
   quats += list(np.moveaxis(demos.mocap_quat, 1, 0))
   for quat in quats:
     off = abs(np.linalg.norm(quat, axis=-1) - 1) > 1e-3
-    _refuse("a quaternion", "is not of unit length", off)
+    _reject("a quaternion", "is not of unit length", off)
   limited = model.jnt_limited.astype(bool)
   low, high = model.jnt_range[limited].T
   joints = demos.qpos[:, model.jnt_qposadr[limited]]
   beyond = (joints < low - _SLACK) | (joints > high + _SLACK)
-  _refuse("qpos", "is beyond the limit of a joint", beyond)
-  _refuse("variant", "is none of the scene's", ~np.isin(demos.variant, range(variants)))
+  _reject("qpos", "is beyond the limit of a joint", beyond)
+  _reject(
+    "variant", "is not one of the scene's", ~np.isin(demos.variant, range(variants))
+  )
   gripper = demos.action[:, -1]
   wrong = (abs(demos.action[:, :-1]) > 1.0).any(1) | ~np.isin(gripper, (0.0, 1.0))
-  _refuse("action", "is not within [-1, 1] rad/s and {0, 1}", wrong)
+  _reject("action", "is not within [-1, 1] rad/s and {0, 1}", wrong)
 
 
-def _shown(array: np.ndarray) -> str:
+def _shorten(array: np.ndarray) -> str:
   return " ".join(str(array).split())[:40]
 
 
-def _refuse(name: str, what: str, wrong: np.ndarray) -> None:
+def _reject(name: str, what: str, wrong: np.ndarray) -> None:
   if wrong.any():
     instant = int(np.argwhere(wrong)[0][0])
     raise FileError(f"{name} {what} at instant {instant}")

@@ -1,4 +1,4 @@
-"""Reads ``.npz`` files that other people made: arrays only, sizes before memory."""
+"""Safe reading of ``.npz`` files: arrays only, with sizes checked before allocation."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from apnpql_jax.errors import FileError, UserError, one_line
 _ERRORS = (OSError, ValueError, EOFError, KeyError, RuntimeError, MemoryError)
 _ERRORS += (NotImplementedError, zipfile.BadZipFile, zlib.error)
 _ERRORS += (LookupError, SyntaxError, TypeError, tokenize.TokenError)
-"""What zipfile and NumPy raise at archives that are none."""
+"""Exceptions raised for malformed archives."""
 
 
 def read(path: Path, *, limit: int) -> dict[str, np.ndarray]:
-  """All arrays of an archive; nothing in it is executed.
+  """Reads all arrays of an archive without executing anything in it.
 
   Args:
     path: the file.
-    limit: bytes that all arrays together may take.
+    limit: maximum size of all arrays together, bytes.
 
   Raises:
-    FileError: it is no archive of arrays, is damaged, holds Python objects, or takes
-      more than ``limit``.
+    FileError: the file is no archive of arrays, is damaged, holds Python objects, or
+      exceeds ``limit``.
   """
   try:
     with zipfile.ZipFile(path) as archive:
@@ -43,7 +43,7 @@ def read(path: Path, *, limit: int) -> dict[str, np.ndarray]:
 
 
 def _nbytes(archive: zipfile.ZipFile, name: str) -> int:
-  """What the header of an array asks for."""
+  """Returns the size of an array in bytes, from its header."""
   with archive.open(name) as file:
     version = np.lib.format.read_magic(file)
     if version != (1, 0):

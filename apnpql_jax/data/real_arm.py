@@ -1,8 +1,8 @@
-"""Recorded joint trajectories to demonstrations.
+"""Conversion of recorded joint trajectories to demonstrations.
 
-A recording knows where the joints and the objects were; velocities and actions follow
-from it. Images are never taken over: they are drawn again from the poses, as the
-worlds of training draw theirs.
+A recording holds the positions of the joints and the poses of the objects. Velocities
+and actions follow from them. Images are not taken from recordings but rendered from the
+poses, as in training.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from apnpql_jax.sim.physics import MAX_VELOCITY
 from apnpql_jax.sim.scene import Scene, free_joints
 
 _STILL = 0.02
-"""Share of the gripper's travel per period below which its command is held."""
+"""Change of the gripper per period, relative to its travel, that keeps its command."""
 
 _LONGEST_GAP_S = 1.0
-"""Between two samples: what lies between is a guess, and takes memory."""
+"""Longest interpolated gap between two samples."""
 
 _LARGEST = 1e30
-"""Of any number: far below what float32 holds."""
+"""Largest magnitude of a number, far below the limit of float32."""
 
 _FINGERS = ("finger_r1", "finger_r2", "finger_l1", "finger_l2")
 
@@ -35,13 +35,12 @@ def convert(path: Path, scene: Scene, *, period_s: float) -> Demonstrations:
   """Reads a recording and samples it once per control period.
 
   Args:
-    path: the recording, an ``.npz`` as ``docs/demonstrations.md`` describes it.
-    scene: gives the bodies whose poses are needed.
+    path: an ``.npz`` file, see ``docs/demonstrations.md``.
+    scene: the scene whose bodies the recording must cover.
     period_s: control period, s.
 
   Raises:
-    FileError: poses are missing, a shape is wrong, or the arm moves faster than it
-      may.
+    FileError: poses are missing, a shape is wrong, or the arm moves too fast.
   """
   arrays = _read(path, scene.model)
   variant, episode = arrays.pop("variant"), arrays.pop("episode")
@@ -60,14 +59,14 @@ def convert(path: Path, scene: Scene, *, period_s: float) -> Demonstrations:
 
 
 def _read(path: Path, model: mujoco.MjModel) -> dict[str, np.ndarray]:
-  """All arrays of a recording, f64 [n, ...], with those that may be left out."""
+  """Reads all arrays, f64[n, ...], with defaults for the optional ones."""
   arrays = npz.read(path, limit=devices.host_memory() or 1 << 32)
   bodies = _bodies(model)
   missing = sorted(bodies.keys() - arrays.keys())
   if missing:
     raise FileError(
-      f"{path} lacks the poses of {', '.join(missing)}: rewards, labels and images are "
-      "made from them, and joint angles or pictures alone do not tell them"
+      f"{path} lacks the poses of {', '.join(missing)}, from which rewards, labels and "
+      "images are computed; record them beside the joint angles"
     )
   shapes = {"time": (), "joints": (6,), "gripper": (), **dict.fromkeys(bodies, (7,))}
   if unknown := sorted(arrays.keys() - shapes.keys() - {"episode", "variant"}):
@@ -95,15 +94,15 @@ def _read(path: Path, model: mujoco.MjModel) -> dict[str, np.ndarray]:
 def _episode(
   recorded: dict[str, np.ndarray], scene: Scene, period_s: float
 ) -> Demonstrations:
-  """One episode, whose time must increase."""
+  """Samples one episode at the control period."""
   model, time = scene.model, recorded["time"]
   steps = np.diff(time)
   if not len(steps) or (steps <= 0).any():
     raise FileError("time must increase within an episode")
   if steps.max() > _LONGEST_GAP_S:
     raise FileError(
-      f"{steps.max():.3g} s lie between two samples, more than {_LONGEST_GAP_S}; begin "
-      "another episode there"
+      f"two samples are {steps.max():.3g} s apart, more than {_LONGEST_GAP_S} s; "
+      "start a new episode there"
     )
   at = np.arange(time[0], time[-1] + 1e-9, period_s)
   poses = {name: _at(at, time, recorded[name]) for name in recorded if name != "time"}
@@ -120,7 +119,7 @@ def _episode(
 def _positions(
   poses: dict[str, np.ndarray], scene: Scene
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-  """qpos f64[n, nq], mocap_pos f64[n, nmocap, 3] and mocap_quat f64[n, nmocap, 4]."""
+  """Returns qpos f64[n, nq], mocap_pos f64[n, nmocap, 3], mocap_quat [n, nmocap, 4]."""
   model, n = scene.model, len(poses["joints"])
   qpos = np.tile(model.qpos0, (n, 1))
   qpos[:, scene.arm_qpos] = poses["joints"]
@@ -140,17 +139,17 @@ def _positions(
 
 
 def _actions(joints: np.ndarray, gripper: np.ndarray, period_s: float) -> np.ndarray:
-  """f32[n, 7] that lead from each instant to the next.
+  """Returns the actions f32[n, 7] that lead from each instant to the next.
 
   Raises:
-    FileError: none does, because the arm moves too fast.
+    FileError: the arm moves faster than any action.
   """
   action = np.zeros((len(joints), 7), np.float32)
   velocity = np.diff(joints, axis=0) / period_s
   if abs(velocity).max(initial=0.0) > 1.05 * MAX_VELOCITY:
     raise FileError(
-      f"the arm moves at {abs(velocity).max():.2f} rad/s, but no action goes beyond "
-      f"{MAX_VELOCITY}; record it slower"
+      f"the arm moves at {abs(velocity).max():.2f} rad/s, but actions are limited to "
+      f"{MAX_VELOCITY} rad/s; record it slower"
     )
   action[:-1, :6] = velocity.clip(-MAX_VELOCITY, MAX_VELOCITY)
   action[:, 6] = _commands(gripper.clip(0.0, 1.0))
@@ -158,9 +157,9 @@ def _actions(joints: np.ndarray, gripper: np.ndarray, period_s: float) -> np.nda
 
 
 def _at(at: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
-  """Columns of ``values`` [n, ...], linear between the times recorded."""
+  """Interpolates ``values`` [n, ...] linearly at the times ``at``."""
   columns = values.reshape(len(time), -1).copy()
-  if columns.shape[1] == 7:  # Poses: q and -q are the same rotation.
+  if columns.shape[1] == 7:  # Poses: q and -q are the same rotation, choose the nearer.
     for i in range(1, len(columns)):
       if columns[i, 3:] @ columns[i - 1, 3:] < 0:
         columns[i, 3:] *= -1
@@ -169,7 +168,7 @@ def _at(at: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _commands(closed: np.ndarray) -> np.ndarray:
-  """f32[n] in {0, 1}: closes while it closes, opens while it opens, else is held."""
+  """Returns commands f32[n] in {0, 1}: 1 while closing, 0 while opening, else held."""
   command = np.zeros(len(closed), np.float32)
   present = float(closed[0] > 0.5)
   for i, change in enumerate(np.diff(closed, append=closed[-1])):
@@ -180,7 +179,7 @@ def _commands(closed: np.ndarray) -> np.ndarray:
 
 
 def _velocities(model: mujoco.MjModel, qpos: np.ndarray, period_s: float) -> np.ndarray:
-  """f64[n, nv], towards the next instant; the last one keeps that before it."""
+  """Returns velocities f64[n, nv] to the next instant; the last one is repeated."""
   qvel = np.zeros((len(qpos), model.nv))
   for i in range(len(qpos) - 1):
     mujoco.mj_differentiatePos(model, qvel[i], period_s, qpos[i], qpos[i + 1])
@@ -189,7 +188,7 @@ def _velocities(model: mujoco.MjModel, qpos: np.ndarray, period_s: float) -> np.
 
 
 def _bodies(model: mujoco.MjModel) -> dict[str, tuple[str, int]]:
-  """Body -> how its pose is held, and where: all that a recording must tell."""
+  """Maps each body that a recording must cover to its kind and its index."""
   bodies = {}
   for i in range(model.nbody):
     name, joint = model.body(i).name, model.body_jntadr[i]

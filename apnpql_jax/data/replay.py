@@ -1,10 +1,9 @@
-"""Replay: a ``[time, world]`` ring that keeps each frame once.
+"""Replay: a ``[time, world]`` ring buffer that stores each frame once.
 
-A slot at time t holds (TimeStep_t, action_t); the reward and the end flags of
-TimeStep_t were received on arriving at t, and the slot after a last one is the
-reset of the next episode. N-step transitions are put together when they are drawn,
-so that no frame is stored twice and N can change without collecting again. So are
-observations of several instants, for agents with an LSTM.
+The slot at time t holds (TimeStep_t, action_t). Reward and end flags of TimeStep_t
+belong to the arrival at t. The slot after a last one is the reset of the next episode.
+N-step transitions, and windows of observations for an LSTM, are assembled at sampling
+time, so no frame is stored twice.
 """
 
 from __future__ import annotations
@@ -15,45 +14,51 @@ from typing import Any
 from flax import struct
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Int
 import numpy as np
 
 from apnpql_jax.types import Array, Slot, Transition
 
 _CANDIDATES = 4
-"""Starts drawn per row; those where an episode ended (1 in 20 to 94) are refused."""
+"""Candidate starts per row; terminal steps (1 in 20 to 94) are rejected."""
 
 
 class Replay(struct.PyTreeNode):
-  """Ring buffer of fixed size; every leaf keeps the dtype of its slot."""
+  """A ring buffer of fixed size."""
 
   slots: Slot  # [length, worlds, ...]
-  cursor: Array  # i32[]: time index written next; the oldest one once full
-  size: Array  # i32[]: time steps held, at most length
+  cursor: Int[Array, ""]  # next time index to write; the oldest one once full
+  size: Int[Array, ""]  # stored time steps, at most length
 
 
 def create(example_slot: Slot, length: int, worlds: int) -> Replay:
-  """An empty ring of ``length`` time steps of ``worlds`` worlds each.
+  """Creates an empty ring.
 
-  ``example_slot`` is one slot of one world, without batch axes; only its shapes and
-  dtypes are read, so that ShapeDtypeStructs do.
+  Args:
+    example_slot: shapes and dtypes of one slot of one world, without batch axes.
+    length: time steps.
+    worlds: worlds per time step.
   """
   slots = jax.tree.map(
     lambda x: jnp.zeros((length, worlds, *x.shape), x.dtype), example_slot
   )
-  # Two arrays, not one twice: a buffer that appears twice cannot be donated.
+  # Two separate zeros: a buffer that appears twice cannot be donated.
   return Replay(slots, cursor=jnp.zeros((), jnp.int32), size=jnp.zeros((), jnp.int32))
 
 
 def add(replay: Replay, chunk: Slot) -> Replay:
-  """Writes a chunk [T, worlds, ...], oldest first, over the oldest time steps.
+  """Writes a chunk over the oldest time steps.
 
-  It must follow on what was added before. All chunks of one replay must have the same
-  T: as T divides the length, no write then crosses the end of the ring. In place if
-  the replay is donated and, within one jit, sampled only after adding.
+  The write is in place if the replay is donated and is sampled only afterwards.
+
+  Args:
+    replay: the ring.
+    chunk: [T, worlds, ...], oldest first; continues the previous chunk. All chunks of
+      a ring have the same T, so no write crosses its end.
 
   Raises:
-    ValueError: at trace time, if T does not divide the length or if a leaf has
-      another shape or dtype than the ring.
+    ValueError: at trace time; T does not divide the length, or a leaf differs in shape
+      or dtype from the ring.
   """
   length, steps = replay.slots.action.shape[0], chunk.action.shape[0]
   if not steps or length % steps:
@@ -74,11 +79,11 @@ def add(replay: Replay, chunk: Slot) -> Replay:
   )
 
 
-def exclude(replay: Replay, steps: Array) -> Replay:
-  """Marks the newest ``steps`` (i32[worlds]) slots of each world as truncated.
+def exclude(replay: Replay, steps: Int[Array, " worlds"]) -> Replay:
+  """Marks the newest ``steps`` slots of each world as truncated.
 
-  No transition starts at a slot that is last, and neither it nor its window reaches
-  beyond one, so that an episode excluded from its first slot on is never drawn.
+  No transition starts at a last slot or reaches beyond one, so an episode that is
+  excluded from its first slot on is never drawn.
   """
   length = replay.slots.action.shape[0]
   age = (replay.cursor - 1 - jnp.arange(length)) % length
@@ -89,18 +94,18 @@ def exclude(replay: Replay, steps: Array) -> Replay:
 
 
 @jax.jit
-def episodes(replay: Replay) -> tuple[Array, Array]:
-  """Episodes whose end is held, i32[]: those that ended in success, and all.
+def episodes(replay: Replay) -> tuple[Int[Array, ""], Int[Array, ""]]:
+  """Counts the successes among the finished episodes, and all finished episodes.
 
-  One that is excluded, all slots of which are last, counts once.
+  An excluded episode, whose slots are all last, counts once.
   """
   timestep = replay.slots.timestep
   ends = timestep.last & ~jnp.roll(timestep.last, 1, axis=0)
   return jnp.sum(ends & timestep.terminated), jnp.sum(ends)
 
 
-def can_sample(replay: Replay, *, n_step: int) -> Array:
-  """bool[]: a slot with ``n_step`` slots after it is held."""
+def can_sample(replay: Replay, *, n_step: int) -> Bool[Array, ""]:
+  """Returns whether some slot has ``n_step`` successors."""
   return replay.size > n_step
 
 
@@ -114,28 +119,27 @@ def sample(
   windows: bool = False,
   instants: int = 0,
 ) -> Transition:
-  """Draws N-step transitions uniformly, with replacement, over all valid starts.
+  """Draws N-step transitions uniformly, with replacement, from all valid starts.
 
-  A start is any slot that is not last, has ``n_step`` slots after it and, with
-  ``instants``, all but one of those before it. The reward
-  is sum_{k=1..m} gamma^(k-1) r_{t+k}, where m is the first k with a last step at
-  t+k and N if there is none; the discount is gamma^m, zero if t+m terminated.
+  A valid start is a slot that is not last, has N successors and, for windows of L
+  observations, L - 1 predecessors. Let m be the first k <= N with a last step at t+k,
+  or N. Then reward_t is sum_{k=1..m} gamma^(k-1) r_{t+k}, and discount_t is gamma^m, or
+  zero if t+m terminated.
 
   Args:
-    replay: the ring; with one key it gives one batch.
+    replay: the ring.
     key: PRNG key.
     batch_size: transitions B.
     n_step: N, at least 1.
     gamma: discount per control period.
-    windows: also return the N instants after the start; past an end of the episode
-      that end again, as what follows may be excluded. Without it
-      ``Transition.window`` is None.
-    instants: L; each observation is [B, L, ...], as ``EnvState.observation``. 0: that of
-      the instant alone.
+    windows: also return the N instants after the start in ``Transition.window``. Past
+      the end of an episode they repeat that end.
+    instants: L; observations are [B, L, ...], as in ``EnvState.observation``. 0 for
+      single observations.
 
   Returns:
-    Transition [B, ...], weights zero where the ring holds no start yet and where four
-    candidates per row held fewer than B valid starts.
+    [B, ...]. The weight is zero where no valid start was found, because the ring is too
+    short or all candidates of the batch were used up.
   """
   before = max(instants - 1, 0)
   time, world, valid = _draw_starts(replay, key, batch_size, n_step, before)
@@ -144,14 +148,16 @@ def sample(
   window = (time[:, None] + 1 + steps) % length  # [B, N]
   flags = (timestep.reward, timestep.terminated, timestep.truncated)
   reward, terminated, truncated = _gather(flags, window, world[:, None])
-  # m - 1: position of the first end; the last column stands for "none within N".
+  # Find m - 1, the position of the first end; the last column means "none within N".
   stop = jnp.argmax((terminated | truncated).at[:, -1].set(True), axis=1)
+  # Discount rewards up to m.
   counted = steps <= stop[:, None]
   powers = jnp.asarray(np.power(gamma, np.arange(n_step + 1)), reward.dtype)
   ended = jnp.take_along_axis(terminated, stop[:, None], axis=1)[:, 0]
+  # Gather the start, the state to bootstrap from, and the window between them.
   window = (time[:, None] + 1 + jnp.minimum(steps, stop[:, None])) % length
-  look = functools.partial(_slots, replay, instants=instants)
-  start, end = look(time, world), look(window[:, -1], world)
+  slots_at = functools.partial(_slots, replay, instants=instants)
+  start, end = slots_at(time, world), slots_at(window[:, -1], world)
   return Transition(
     observation_tm1=start.timestep.observation,
     action_tm1=start.action,
@@ -160,12 +166,12 @@ def sample(
     observation_t=end.timestep.observation,
     primitives_tm1=start.timestep.primitives,
     weight=valid.astype(reward.dtype),
-    window=look(window, world[:, None]) if windows else None,
+    window=slots_at(window, world[:, None]) if windows else None,
   )
 
 
 def expert_count(batch_size: int, expert_share: float) -> int:
-  """Transitions of a batch that come from the expert replay, the same every time."""
+  """Returns how many transitions of each batch come from the expert's replay."""
   if not 0.0 <= expert_share <= 1.0:
     raise ValueError(f"expert_share {expert_share} is not within [0, 1]")
   return round(batch_size * expert_share)
@@ -183,11 +189,13 @@ def sample_mixed(
   windows: bool = False,
   instants: int = 0,
 ) -> Transition:
-  """``sample`` of both replays: agent rows first, then ``expert_count`` expert rows.
+  """Draws a batch from both replays: agent rows first, then ``expert_count`` rows.
 
-  The counts never change: rows of a replay still too small to draw from have weight
-  zero. Filling them from the other would silently change the configured share.
-  Without expert rows the expert replay may be None (ValueError otherwise).
+  The counts are fixed. Rows of a replay that is still too short have weight zero, since
+  replacing them would change the configured share. See ``sample`` for the arguments.
+
+  Raises:
+    ValueError: the batch has expert rows, but ``expert_replay`` is None.
   """
   from_expert = expert_count(batch_size, expert_share)
   if from_expert and expert_replay is None:
@@ -207,16 +215,16 @@ def sample_mixed(
 def _draw_starts(
   replay: Replay, key: Array, batch_size: int, n_step: int, before: int
 ) -> tuple[Array, Array, Array]:
-  """Time index, world and validity, each [B]. Draws candidates, keeps valid ones first.
+  """Draws starts by rejection: time index, world and validity, each [B].
 
-  Candidates are independent and uniform over the slots with n_step after and
-  ``before`` before them, hence those kept are so over the valid ones.
+  Candidates are independent and uniform over the slots with ``n_step`` successors and
+  ``before`` predecessors, so the accepted ones are uniform over the valid starts.
   """
   length, worlds = replay.slots.action.shape[:2]
   key_offset, key_world = jax.random.split(key)
   shape = (_CANDIDATES * batch_size,)
   span = jnp.maximum(replay.size - before - n_step, 1)
-  # Offsets count from the oldest slot, so that no window reaches across the seam.
+  # Offsets count from the oldest slot, so no window crosses the seam.
   offset = jax.random.randint(key_offset, shape, 0, span)
   time = (replay.cursor - replay.size + before + offset) % length
   world = jax.random.randint(key_world, shape, 0, worlds)
@@ -228,10 +236,10 @@ def _draw_starts(
 
 
 def _slots(replay: Replay, time: Array, world: Array, *, instants: int) -> Slot:
-  """Slots at (time, world) [*b]; with L ``instants``, observations are [*b, L, ...].
+  """Gathers slots at (time, world) [*b], with observations [*b, L, ...] for L instants.
 
-  The episode of a slot begins after the newest end before it; where it is shorter than
-  L, its first observation is repeated.
+  An episode begins after the newest end before its slot. If it is shorter than L, its
+  first observation is repeated.
   """
   slots = _gather(replay.slots, time, world)
   if not instants:
@@ -241,15 +249,15 @@ def _slots(replay: Replay, time: Array, world: Array, *, instants: int) -> Slot:
   earlier = jnp.stack([time - 1 - k for k in range(instants)], axis=-1) % length
   flags = (timestep.terminated, timestep.truncated)
   terminated, truncated = _gather(flags, earlier, world)
-  # Slots of the episode before this one; the last column stands for "L - 1 or more".
+  # Count earlier slots of the episode; the last column means "L - 1 or more".
   before = jnp.argmax((terminated | truncated).at[..., -1].set(True), axis=-1)
   past = [time - jnp.minimum(k, before) for k in reversed(range(instants))]
-  seen = _gather(timestep.observation, jnp.stack(past, axis=-1) % length, world)
-  return slots.replace(timestep=slots.timestep.replace(observation=seen))
+  recent = _gather(timestep.observation, jnp.stack(past, axis=-1) % length, world)
+  return slots.replace(timestep=slots.timestep.replace(observation=recent))
 
 
 def _gather(tree: Any, time: Array, world: Array) -> Any:
-  """Slots at (time, world) of every leaf; the indices are known to be in the ring."""
+  """Gathers (time, world) of every leaf; the indices are always within the ring."""
   mode = "promise_in_bounds"
   return jax.tree.map(
     lambda x: x.at[time, world].get(mode=mode, wrap_negative_indices=False), tree

@@ -15,8 +15,7 @@ from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
 
-FLAT = 0.002
-"""m; thinner geoms are flat marks on the table, which receive shadows as it does."""
+FLAT = 0.002  # m; thinner geoms are marks on the table and receive shadows as it does
 
 Renderer = Callable[[Kinematics], Array]
 

@@ -14,11 +14,8 @@ from apnpql_jax.sim import engines, physics
 from apnpql_jax.tasks import Task
 
 WORLDS = 64
-SUBSTEPS = 30
-"""Physics steps per timed call: one control period of 0.15 s at 5 ms."""
-
-REPEATS = 3
-"""Timed calls, after one that compiles; the fastest counts."""
+SUBSTEPS = 30  # physics steps per timed call: one control period of 0.15 s at 5 ms
+REPEATS = 3  # timed calls, after one that compiles; the fastest counts
 
 
 def contact_report(

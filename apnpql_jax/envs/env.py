@@ -30,11 +30,8 @@ from apnpql_jax.sim.scene import Scene
 from apnpql_jax.tasks import Task, make_task
 from apnpql_jax.types import Array, Observation, TimeStep
 
-HISTORY = 3
-"""Robot states stacked in an observation (paper Sec. V-A)."""
-
-HELD_OUT_SHARE = 0.25
-"""Share of the bank's rows that is reserved for evaluation."""
+HISTORY = 3  # robot states stacked in an observation (paper Sec. V-A)
+HELD_OUT_SHARE = 0.25  # share of the bank's rows that is reserved for evaluation
 
 
 class Env:

@@ -39,7 +39,6 @@ from apnpql_jax.types import Array
 
 VERSION = 3
 """Part of the cache key; increased when the meaning of a bank changes."""
-
 SEED = 0
 CHUNK = 32
 MAX_DRAWS = 20
@@ -50,7 +49,6 @@ SETTLE_SPEED = 0.05
 """m/s and rad/s; above float32 contact noise (0.04)."""
 SETTLE_SHIFT = 0.005
 """m; an object that moves further while it settles overlapped with another."""
-
 MAX_TRAVEL = 2.5
 """rad; a joint that turns further would pass through another branch of the arm's
 configurations."""
@@ -100,7 +98,14 @@ def load_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
     report = BankReport(**json.loads(str(arrays.pop("report"))))
     return ResetBank(**jax.tree.map(jnp.asarray, arrays)), report
   bank, report = build_bank(task, rows)
-  _store(path, bank, report)
+  arrays: dict[str, Any] = jax.tree.map(np.asarray, vars(bank))
+  path.parent.mkdir(parents=True, exist_ok=True)
+  # Written atomically, so that no concurrent run reads an incomplete file.
+  with tempfile.NamedTemporaryFile(
+    dir=path.parent, suffix=".npz", delete=False
+  ) as file:
+    np.savez(file, report=json.dumps(vars(report)), **arrays)
+  os.replace(file.name, path)
   return bank, report
 
 
@@ -168,14 +173,12 @@ def _solve_targets(
   positions, rotations, _ = map(np.asarray, task.tool_targets(state, kinematics))
   starts = np.asarray(state.qpos[:, task.scene.arm_qpos])
   arrays = starts, positions, rotations
-  futures = [
-    pool.submit(ik.solve_all, *(x[i : i + CHUNK] for x in arrays))
-    for i in range(0, len(starts), CHUNK)
-  ]
-  for future in concurrent.futures.as_completed(futures):
-    advance(len(future.result()[0]))
-  solved = zip(*[future.result() for future in futures], strict=True)
-  targets, residuals = map(np.concatenate, solved)
+  chunks = [np.split(x, range(CHUNK, len(x), CHUNK)) for x in arrays]
+  solved = []
+  for result in pool.map(ik.solve_all, *chunks):
+    solved.append(result)
+    advance(len(result[0]))
+  targets, residuals = map(np.concatenate, zip(*solved, strict=True))
   reached = (residuals < [ik.POSITION_TOLERANCE, ik.ROTATION_TOLERANCE]).all((1, 2))
   reached &= np.abs(targets - starts[:, None]).max((1, 2)) < MAX_TRAVEL
   report.rejected_unreachable += int((~reached).sum())
@@ -207,14 +210,3 @@ def _source(task: Task) -> str:
     if "\n@register_task\n" not in (text := path.read_text(encoding="utf-8")):
       digest.update(text.encode())
   return digest.hexdigest()
-
-
-def _store(path: pathlib.Path, bank: ResetBank, report: BankReport) -> None:
-  """Writes atomically, so that no concurrent run reads an incomplete file."""
-  path.parent.mkdir(parents=True, exist_ok=True)
-  arrays: dict[str, Any] = jax.tree.map(np.asarray, vars(bank))
-  with tempfile.NamedTemporaryFile(
-    dir=path.parent, suffix=".npz", delete=False
-  ) as file:
-    np.savez(file, report=json.dumps(dataclasses.asdict(report)), **arrays)
-  os.replace(file.name, path)

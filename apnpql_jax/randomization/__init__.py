@@ -1,1 +1,1 @@
-"""Domain randomization: every episode has a world of its own (paper Sec. V-C)."""
+"""Domain randomization: every episode has its own world (paper Sec. V-C)."""

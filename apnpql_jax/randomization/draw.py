@@ -1,4 +1,4 @@
-"""A world that is being drawn: its random numbers, and its fields."""
+"""The random numbers and the fields of a world that is being drawn."""
 
 from __future__ import annotations
 
@@ -17,48 +17,42 @@ from apnpql_jax.types import Array
 
 @dataclasses.dataclass(frozen=True)
 class Draw:
-  """Random numbers of one world, one stream for each setting.
+  """Random numbers of one world.
 
-  A setting of 0 hence changes nothing in what the others draw.
+  Each setting has its own stream, so that turning one off leaves the others unchanged.
   """
 
   key: Array
   config: RandomizationConfig
 
   def uniform(self, name: str, shape: tuple[int, ...] = ()) -> Array:
-    """f32[shape] between minus and plus the range of a setting."""
+    """Draws f32[shape] between minus and plus the range of a setting."""
     spread = getattr(self.config, name)
     return jax.random.uniform(self.stream(name), shape, jnp.float32, -spread, spread)
 
-  def share(self, name: str, shape: tuple[int, ...] = ()) -> Array:
-    """f32[shape] factors around one."""
+  def factor(self, name: str, shape: tuple[int, ...] = ()) -> Array:
+    """Draws factors f32[shape] around one, by the range of a setting."""
     return 1.0 + self.uniform(name, shape)
 
   def stream(self, name: str) -> Array:
-    """The key of a setting."""
+    """Returns the key of a setting."""
     names = [field.name for field in dataclasses.fields(self.config)]
     return jax.random.fold_in(self.key, names.index(name))
 
 
-class World:
-  """One world that is being drawn: what its fields are by now."""
+class World(dict[str, Array]):
+  """The fields of a world that is being drawn; others read as those of the model."""
 
   def __init__(self, model: mujoco.MjModel, fields: dict[str, Array]):
+    super().__init__(fields)
     self.model = model
-    self.fields = dict(fields)
 
-  def __getitem__(self, name: str) -> Array:
-    """A model field or the color of the background, f32[...]."""
-    value = self.fields.get(name)
-    if value is None:
-      plain = Lighting() if name == "background" else self.model
-      value = jnp.asarray(getattr(plain, name), jnp.float32)
-    return value
-
-  def __setitem__(self, name: str, value: Array) -> None:
-    self.fields[name] = value
+  def __missing__(self, name: str) -> Array:
+    """Returns a field of the model or the color of the background, f32[...]."""
+    source = Lighting() if name == "background" else self.model
+    return jnp.asarray(getattr(source, name), jnp.float32)
 
 
 def free_bodies(model: mujoco.MjModel) -> np.ndarray:
-  """bool[nbody]: the bodies that float freely."""
+  """Returns a mask bool[nbody] of the bodies with a free joint."""
   return np.isin(np.arange(model.nbody), model.jnt_bodyid[free_joints(model)])

@@ -1,4 +1,4 @@
-"""Sizes, shapes and masses of the objects of a world, and what follows from them."""
+"""Sizes, shapes and masses of a world's objects, and constants derived from them."""
 
 from __future__ import annotations
 
@@ -11,46 +11,52 @@ from apnpql_jax.types import Array
 
 
 def scale(draw: Draw, world: World, qpos: Array) -> Array:
-  """Scales objects about their frames, along z by a factor of its own.
+  """Scales objects about their frames, with a separate factor along z.
 
   Returns:
-    f32[nq]: the objects stand where they stood.
+    qpos f32[nq] with the objects raised or lowered to stand on the table again.
   """
   if not (draw.config.size or draw.config.shape):
     return qpos
   model, objects = world.model, np.flatnonzero(free_bodies(world.model))
-  width = draw.share("size", (model.nbody,))
-  height = width * draw.share("shape", (model.nbody,))
+  width = draw.factor("size", (model.nbody,))
+  height = width * draw.factor("shape", (model.nbody,))
   factors = jnp.stack([width, width, height], axis=-1)[objects]
-  of_body = jnp.ones((model.nbody, 3)).at[objects].set(factors)
-  of_geom = of_body[model.geom_bodyid]
-  axes = of_geom[:, :1] + (of_geom[:, 2:] - of_geom[:, :1]) * _upright(model.geom_quat)
-  world["geom_size"] = world["geom_size"] * _of_sizes(model, axes)
-  world["geom_pos"] = world["geom_pos"] * of_geom
-  world["geom_aabb"] = world["geom_aabb"] * jnp.tile(axes, 2)
-  world["geom_rbound"] = world["geom_rbound"] * of_geom.max(axis=-1)
-  world["body_ipos"] = world["body_ipos"] * of_body
+
+  # Scale geoms along their own axes, which need not be those of the body.
+  body_factors = jnp.ones((model.nbody, 3)).at[objects].set(factors)
+  geom_factors = body_factors[model.geom_bodyid]
+  across, along = geom_factors[:, :1], geom_factors[:, 2:]
+  axes = across + (along - across) * _uprightness(model.geom_quat)
+  world["geom_size"] *= _size_factors(model, axes)
+  world["geom_pos"] *= geom_factors
+  world["geom_aabb"] *= jnp.tile(axes, 2)
+  world["geom_rbound"] *= geom_factors.max(axis=-1)
+  world["body_ipos"] *= body_factors
+
   # An inertia is the sum of the second moments along the other two axes.
   inertia = world["body_inertia"]
   moments = 0.5 * inertia[objects].sum(-1, keepdims=True) - inertia[objects]
   moments = moments * factors**2
-  changed = moments.sum(-1, keepdims=True) - moments
-  world["body_inertia"] = inertia.at[objects].set(changed)
+  scaled = moments.sum(-1, keepdims=True) - moments
+  world["body_inertia"] = inertia.at[objects].set(scaled)
+
+  # Objects on the table keep standing on it.
   address = model.jnt_qposadr[model.body_jntadr[objects]]
-  standing = _upright(qpos[address[:, None] + np.arange(3, 7)])[:, 2]
-  tall = factors[:, 0] + (factors[:, 2] - factors[:, 0]) * standing
-  return qpos.at[address + 2].multiply(tall)
+  upright = _uprightness(qpos[address[:, None] + np.arange(3, 7)])[:, 2]
+  vertical = factors[:, 0] + (factors[:, 2] - factors[:, 0]) * upright
+  return qpos.at[address + 2].multiply(vertical)
 
 
-def _upright(quat: Array | np.ndarray) -> Array:
-  """f32[*b, 3]: how far along z, from 0 to 1, the axes of frames [*b, 4] lie."""
+def _uprightness(quat: Array | np.ndarray) -> Array:
+  """Returns the absolute z components f32[*b, 3] of the axes of frames [*b, 4]."""
   w, x, y, z = jnp.moveaxis(jnp.asarray(quat, jnp.float32), -1, 0)
   along = [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)]
   return jnp.abs(jnp.stack(along, axis=-1))
 
 
-def _of_sizes(model: mujoco.MjModel, axes: Array) -> Array:
-  """f32[ngeom, 3]: factors of MuJoCo's sizes, from those along the geoms' own axes."""
+def _size_factors(model: mujoco.MjModel, axes: Array) -> Array:
+  """Converts factors along the geoms' own axes to those of MuJoCo's sizes."""
   kinds = mujoco.mjtGeom
   radius = axes[:, :2].mean(axis=-1)
   round_ = jnp.stack([radius, axes[:, 2], axes[:, 2]], axis=-1)
@@ -65,19 +71,19 @@ def weigh(draw: Draw, world: World) -> None:
   if not draw.config.mass:
     return
   objects = free_bodies(world.model)
-  factor = jnp.where(objects, draw.share("mass", (world.model.nbody,)), 1.0)
+  factor = jnp.where(objects, draw.factor("mass", (world.model.nbody,)), 1.0)
   gained = (factor - 1.0) * world["body_mass"]
-  world["body_mass"] = world["body_mass"] * factor
-  world["body_inertia"] = world["body_inertia"] * factor[:, None]
+  world["body_mass"] *= factor
+  world["body_inertia"] *= factor[:, None]
   whole = world["body_subtreemass"] + gained
   world["body_subtreemass"] = whole.at[0].add(gained.sum())
 
 
 def derive(world: World) -> None:
-  """What MuJoCo derives from mass, inertia and center of the bodies that float freely.
+  """Recomputes MuJoCo's constants that depend on mass, inertia and center of objects.
 
-  A free joint moves along three axes, then turns about three. Axes of inertia are those
-  of the body.
+  A free joint moves along three axes, then turns about three. The axes of inertia are
+  those of the body.
   """
   model = world.model
   objects = np.flatnonzero(free_bodies(model))

@@ -1,11 +1,11 @@
-"""Gives every episode a world of its own.
+"""Draws a separate world for every episode.
 
-What is drawn goes into ``PhysicsState.fields``, which both engines, the kinematics and
-the cameras read, so it costs no recompilation and videos show it. Constants that MuJoCo
-derives from masses and sizes are derived, too (``objects``).
+The values go into ``PhysicsState.fields``, which both engines, the kinematics and the
+cameras read. They therefore cost no recompilation, and videos show them. Constants that
+MuJoCo derives from masses and sizes are recomputed (``objects``).
 
-The table stays where it is: it is the robot that stands lower or higher, tilted or
-turned on it. Tasks can then go on to measure from the table.
+The table stays in place and the robot stands lower or higher, tilted or turned on it,
+so that tasks can measure from the table.
 """
 
 from __future__ import annotations
@@ -23,15 +23,14 @@ from apnpql_jax.sim.physics import GRIPPER_SPEED, PhysicsState
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
 
-WRIST_SHARE = 0.1
-"""How much less than the global camera that on the wrist is shifted."""
+WRIST_SHARE = 0.1  # shift of the wrist camera, as a share of that of the global camera
 
 Randomize = Callable[[PhysicsState, Array], PhysicsState]
-"""(states at rest [worlds, ...], keys [worlds]) -> the same in worlds of their own."""
+"""(states at rest [worlds, ...], keys [worlds]) -> the same states in drawn worlds."""
 
 
 def make_randomize(config: RandomizationConfig, scene: Scene) -> Randomize:
-  """The function that gives episodes worlds of their own."""
+  """Returns the function that draws a world for each episode."""
 
   def one(state: PhysicsState, key: Array) -> PhysicsState:
     draw, world = Draw(key, config), World(scene.model, state.fields)
@@ -44,9 +43,10 @@ def make_randomize(config: RandomizationConfig, scene: Scene) -> Randomize:
     objects.weigh(draw, world)
     if config.size or config.shape or config.mass:
       objects.derive(world)
-    _contacts(draw, world)
+    if config.friction:
+      world["pair_friction"] *= draw.factor("friction")
     command = _control(draw, world, scene, qpos)
-    return state.replace(qpos=qpos, fields=world.fields, command=command)
+    return state.replace(qpos=qpos, fields=dict(world), command=command)
 
   return jax.vmap(one)
 
@@ -54,14 +54,13 @@ def make_randomize(config: RandomizationConfig, scene: Scene) -> Randomize:
 def _cameras(draw: Draw, world: World) -> None:
   config, count = draw.config, world.model.ncam
   if config.camera_shift:
-    far = np.where(world.model.cam_bodyid == 0, 1.0, WRIST_SHARE).astype(np.float32)
-    shift = draw.uniform("camera_shift", (count, 3))
-    world["cam_pos"] = world["cam_pos"] + far[:, None] * shift
+    share = np.where(world.model.cam_bodyid == 0, 1.0, WRIST_SHARE).astype(np.float32)
+    world["cam_pos"] += share[:, None] * draw.uniform("camera_shift", (count, 3))
   if config.camera_turn:
     turn = draw.uniform("camera_turn", (count, 3))
     world["cam_quat"] = _turned(world["cam_quat"], turn)
   if config.field_of_view:
-    world["cam_fovy"] = world["cam_fovy"] * draw.share("field_of_view", (count,))
+    world["cam_fovy"] *= draw.factor("field_of_view", (count,))
 
 
 def _table(draw: Draw, world: World) -> None:
@@ -72,26 +71,20 @@ def _table(draw: Draw, world: World) -> None:
   if config.table_tilt or config.table_turn:
     turn = jnp.append(draw.uniform("table_tilt", (2,)), draw.uniform("table_turn"))
     quat = world["body_quat"]
-    # In the world's axes, hence the inverse of a turn in the base's.
+    # About the world's axes: the inverse of a turn about the base's own axes.
     level = _turned(_inverse(quat[base]), -turn)
     world["body_quat"] = quat.at[base].set(_inverse(level))
 
 
-def _contacts(draw: Draw, world: World) -> None:
-  if draw.config.friction:
-    world["pair_friction"] = world["pair_friction"] * draw.share("friction")
-
-
 def _control(draw: Draw, world: World, scene: Scene, qpos: Array) -> Array | None:
-  """Damping, gripper and delay; returns what commands begin with if they are late."""
+  """Draws damping, gripper and delay; returns the first command where it is delayed."""
   config, model = draw.config, world.model
   if config.damping:
     robot = model.body_rootid[model.dof_bodyid] == model.body("base").id
     rate = jnp.abs(draw.uniform("damping", (model.nv,)))
-    added = jnp.where(robot, rate * world["dof_M0"], 0.0)
-    world["dof_damping"] = world["dof_damping"] + added
+    world["dof_damping"] += jnp.where(robot, rate * world["dof_M0"], 0.0)
   if config.gripper_speed:
-    world["gripper_speed"] = GRIPPER_SPEED * draw.share("gripper_speed")
+    world["gripper_speed"] = GRIPPER_SPEED * draw.factor("gripper_speed")
   if not config.delay_s:
     return None
   longest = round(config.delay_s / model.opt.timestep)
@@ -102,7 +95,7 @@ def _control(draw: Draw, world: World, scene: Scene, qpos: Array) -> Array | Non
 
 
 def _turned(quat: Array, turn: Array) -> Array:
-  """Unit quaternions f32[*b, 4] after small turns f32[*b, 3] about their own axes."""
+  """Applies small turns f32[*b, 3] (rad) about own axes to quaternions f32[*b, 4]."""
   w, x, y, z = jnp.moveaxis(quat, -1, 0)
   a, b, c = jnp.moveaxis(0.5 * turn, -1, 0)
   turned = jnp.stack(

@@ -10,72 +10,70 @@ import numpy as np
 from apnpql_jax.randomization.draw import Draw, World
 from apnpql_jax.render import Lighting
 
-SQUARES = (0.015, 0.15)
-"""m; edges of a checker's squares."""
-
-WAVES = (0.02, 0.3)
-"""m; from crest to crest of noise."""
+SQUARES = (0.015, 0.15)  # m; edges of a checker's squares
+WAVES = (0.02, 0.3)  # m; wavelengths of noise
 
 
 def color(draw: Draw, world: World) -> None:
-  """Changes the colors of robot, table, objects and background, each by itself."""
+  """Changes the colors of robot, table, each object and the background separately."""
   if not draw.config.color:
     return
   change = draw.uniform("color", (world.model.nbody + 1, 3))
-  rgb = world["geom_rgba"][:, :3] + change[_alike(world.model)]
-  alpha = world["geom_rgba"][:, 3:]
-  world["geom_rgba"] = jnp.concatenate([rgb.clip(0.0, 1.0), alpha], axis=-1)
+  rgb, alpha = jnp.split(world["geom_rgba"], [3], axis=-1)
+  rgb = (rgb + change[_groups(world.model)]).clip(0.0, 1.0)
+  world["geom_rgba"] = jnp.concatenate([rgb, alpha], axis=-1)
   world["background"] = (world["background"] + change[-1]).clip(0.0, 1.0)
 
 
 def texture(draw: Draw, world: World) -> None:
-  """Makes a third each of what looks alike, and of the backgrounds, plain, checkered
-  and noisy."""
+  """Makes a third each of the groups and backgrounds plain, checkered and noisy."""
   if not draw.config.texture:
     return
   model, count = world.model, world.model.nbody + 1
-  groups = np.append(_alike(model), model.nbody)  # The background is the last.
+  groups = np.append(_groups(model), model.nbody)  # The background is the last.
   kind, side, turn, phase = jax.random.split(draw.stream("texture"), 4)
   kind = jax.random.randint(kind, (count,), 0, 3)
   change = draw.uniform("texture", (count, 3))
-  # A checker's squares are half waves; a plane has none across it.
+
+  # A checker's squares are half waves along the axes; a plane has none across it.
   low, high = np.log(SQUARES)
   edge = jnp.exp(jax.random.uniform(side, (count, 1, 1), jnp.float32, low, high))
-  checker = (jnp.eye(3) * 0.5 / edge)[groups]
-  flat = np.append(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, False)
-  checker = (
-    checker * jnp.where(flat[:, None] & (np.arange(3) == 2), 0.0, 1.0)[..., None]
-  )
+  plane = np.append(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, False)
+  varies = jnp.where(plane[:, None] & (np.arange(3) == 2), 0.0, 1.0)
+  checker = (jnp.eye(3) * 0.5 / edge)[groups] * varies[..., None]
+
+  # Noise is three waves in random directions.
   noise = jax.random.normal(turn, (count, 3, 3))
   noise = noise / jnp.linalg.norm(noise, axis=-1, keepdims=True)
   noise = noise / np.geomspace(*WAVES, 3, dtype=np.float32)[:, None]
   vectors = jnp.where((kind == 2)[groups][:, None, None], noise[groups], checker)
   phase = jax.random.uniform(phase, (count, 3, 1))[groups]
   world["waves"] = jnp.concatenate([vectors, phase], axis=-1)
+
+  # The odd squares have another color; noise only darkens, so it may by two changes.
   rgb = jnp.concatenate([world["geom_rgba"][:, :3], world["background"][None]])
   other = (rgb + change[groups]).clip(0.0, 1.0)
   world["odd_rgb"] = jnp.where((kind == 1)[groups][:, None], other, rgb)
-  # Noise only darkens, so what it takes may be as much as two changes.
   grain = jnp.where(kind == 2, 2.0 * jnp.abs(change[:, 0]), 0.0)
   world["grain"] = grain[groups]
 
 
 def light(draw: Draw, world: World) -> None:
-  """Changes where the light comes from, and how bright it is."""
+  """Changes the direction and the brightness of the light."""
   if draw.config.light_turn:
-    toward = world["light_dir"]
-    world["light_dir"] = toward + draw.uniform("light_turn", toward.shape)
+    shape = world["light_dir"].shape
+    world["light_dir"] += draw.uniform("light_turn", shape)
   if draw.config.light_level:
     plain, ones = Lighting(), jnp.ones_like(world["light_ambient"])
-    ambient, diffuse = draw.share("light_level", (2,)) * jnp.asarray(
+    ambient, diffuse = draw.factor("light_level", (2,)) * jnp.asarray(
       [plain.ambient, plain.diffuse], jnp.float32
     )
-    # No brighter than all there is: colors would be cut off.
+    # Keep the sum within one, where colors would be clipped.
     most = jnp.maximum(1.0, ambient + diffuse)
     world["light_ambient"] = ambient / most * ones
     world["light_diffuse"] = diffuse / most * ones
 
 
-def _alike(model: mujoco.MjModel) -> np.ndarray:
-  """i32[ngeom]: what looks alike: the robot, the table, each object."""
+def _groups(model: mujoco.MjModel) -> np.ndarray:
+  """Returns the group i32[ngeom] of each geom: the robot, the table or an object."""
   return model.body_rootid[model.geom_bodyid]

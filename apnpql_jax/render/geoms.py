@@ -13,17 +13,7 @@ import mujoco
 import numpy as np
 
 from apnpql_jax.errors import ConfigError
-
-_TYPES = mujoco.mjtGeom
-SUPPORTED = (
-  _TYPES.mjGEOM_PLANE,
-  _TYPES.mjGEOM_SPHERE,
-  _TYPES.mjGEOM_CAPSULE,
-  _TYPES.mjGEOM_ELLIPSOID,
-  _TYPES.mjGEOM_BOX,
-  _TYPES.mjGEOM_CYLINDER,
-)
-"""Geom types with a closed-form intersection in ``intersect``."""
+from apnpql_jax.render.intersect import HITS
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -61,10 +51,8 @@ class Geoms:
     colors, odd_colors = rgba[ids, :3].copy(), np.zeros((len(ids), 3))
     checker = np.zeros(len(ids))
     for k, i in enumerate(ids):
-      texture = _texture_id(model, i)
-      _check_drawable(model, i, texture)
-      if texture >= 0:
-        checker[k], even, odd = _read_checker(model, i, texture)
+      if (texture := _read_texture(model, i)) is not None:
+        checker[k], even, odd = texture
         colors[k], odd_colors[k] = colors[k] * even, colors[k] * odd
     return cls(
       ids=ids.astype(np.int32),
@@ -192,30 +180,28 @@ def _effective_rgba(model: mujoco.MjModel) -> np.ndarray:
   return rgba
 
 
-def _check_drawable(model: mujoco.MjModel, geom_id: int, texture: int) -> None:
-  kind, name = _TYPES(int(model.geom_type[geom_id])), _geom_name(model, geom_id)
-  if kind not in SUPPORTED:
-    valid = ", ".join(t.name for t in SUPPORTED)
-    raise ConfigError(f"cannot draw {name!r}: {kind.name} (valid: {valid})")
-  if texture >= 0 and kind != _TYPES.mjGEOM_PLANE:
+def _read_texture(
+  model: mujoco.MjModel, geom_id: int
+) -> tuple[float, np.ndarray, np.ndarray] | None:
+  """Reads a geom's checker.
+
+  Returns:
+    Edge (m) and colors of even and odd squares; None for a geom without a texture.
+
+  Raises:
+    ConfigError: the geom or its texture cannot be drawn.
+  """
+  kind, material = int(model.geom_type[geom_id]), model.geom_matid[geom_id]
+  name = model.geom(geom_id).name or f"geom {geom_id}"
+  if kind not in HITS:
+    found, *valid = (mujoco.mjtGeom(x).name for x in (kind, *HITS))
+    raise ConfigError(f"cannot draw {name!r}: {found} (valid: {', '.join(valid)})")
+  role = mujoco.mjtTextureRole.mjTEXROLE_RGB
+  texture = model.mat_texid[material, role] if material >= 0 else -1
+  if texture < 0:
+    return None
+  if kind != mujoco.mjtGeom.mjGEOM_PLANE:
     raise ConfigError(f"cannot draw the texture of {name!r}: it is not on a plane")
-
-
-def _geom_name(model: mujoco.MjModel, geom_id: int) -> str:
-  return model.geom(geom_id).name or f"geom {geom_id}"
-
-
-def _texture_id(model: mujoco.MjModel, geom_id: int) -> int:
-  material = model.geom_matid[geom_id]
-  if material < 0:
-    return -1
-  return int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB])
-
-
-def _read_checker(
-  model: mujoco.MjModel, geom_id: int, texture: int
-) -> tuple[float, np.ndarray, np.ndarray]:
-  """Returns a checker's edge (m) and the colors of its even and odd squares."""
   height, width = model.tex_height[texture], model.tex_width[texture]
   channels, start = model.tex_nchannel[texture], model.tex_adr[texture]
   data = model.tex_data[start : start + height * width * channels]
@@ -223,11 +209,9 @@ def _read_checker(
   odd, even = data[height // 4, width // 4], data[height // 4, 3 * width // 4]
   row, column = np.arange(height) * 2 // height, np.arange(width) * 2 // width
   expected = np.where(((row[:, None] + column) % 2 == 0)[..., None], odd, even)
-  material = model.geom_matid[geom_id]
   size = model.geom_size[geom_id, :2]
   scale = np.where((size > 0) & ~model.mat_texuniform[material], size, 1.0)
   scale = scale / model.mat_texrepeat[material]
   if not np.array_equal(data, expected) or scale[0] != scale[1]:
-    name = _geom_name(model, geom_id)
     raise ConfigError(f"cannot draw the texture of {name!r}: not a square checker")
   return float(scale[0]), even / 255.0, odd / 255.0

@@ -100,7 +100,7 @@ def prepare(
 
 
 def row(frames: Frames, k: int) -> Frames:
-  """Returns the frame of geom k alone."""
+  """Returns the inputs of geom k alone."""
   return Frames(*(field[k] for field in frames))
 
 

@@ -94,11 +94,11 @@ def render(
   one = functools.partial(_render_one, geoms, camera, lighting, tuple(outputs), near)
   fields = {k: v for k, v in (fields or {}).items() if k in FIELDS}
   if not batch:
-    return one(*poses, fields)
+    return one(poses, fields)
   flat, fields = jax.tree.map(
     lambda x: x.reshape(-1, *x.shape[len(batch) :]), (poses, fields)
   )
-  image = jax.vmap(one)(*flat, fields)
+  image = jax.vmap(one)(flat, fields)
   return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), image)
 
 
@@ -108,13 +108,11 @@ def _render_one(
   lighting: Lighting,
   outputs: tuple[str, ...],
   near: float,
-  geom_xpos: Array,
-  geom_xmat: Array,
-  cam_xpos: Array,
-  cam_xmat: Array,
+  poses: tuple[Array, Array, Array, Array],
   fields: Mapping[str, Array],
 ) -> Image:
   """Renders one image; see ``render`` for the arguments, here without leading axes."""
+  geom_xpos, geom_xmat, cam_xpos, cam_xmat = poses
   to_camera = cam_xmat[None, :, :]
   center = ((geom_xpos[geoms.ids] - cam_xpos[None])[:, :, None] * to_camera).sum(axis=1)
   axes = (to_camera[..., None] * geom_xmat[geoms.ids][:, :, None, :]).sum(axis=1)
@@ -205,7 +203,10 @@ def _cast(
     t = jnp.where(closer, t_k, t)
     paint = jnp.where(closer, index + _intensity(lighting, look, cosine), paint)
   if lighting.shadow_casters:
-    dark = shadow.darkness(geoms, lighting.shadow_casters, frames, rays, t, basis)
+    dark = jnp.zeros(t.shape, bool)
+    for k in geoms.rows(lighting.shadow_casters, shadow.SHADOWS):
+      darkens = shadow.SHADOWS[int(geoms.types[k])]
+      dark = dark | darkens(intersect.row(frames, k), rays, t, basis)
     index = jnp.floor(paint)
     receives = jnp.zeros(t.shape, bool)
     for k in geoms.rows(lighting.shadow_receivers, intersect.HITS):

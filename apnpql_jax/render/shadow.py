@@ -15,8 +15,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from apnpql_jax.render.geoms import Geoms
-from apnpql_jax.render.intersect import TINY, Frames, Rays, along, row, slab
+from apnpql_jax.render.intersect import TINY, Frames, Rays, along, slab
 from apnpql_jax.types import Array
 
 
@@ -74,22 +73,3 @@ SHADOWS: dict[int, Callable[[Frames, Rays, Array, Array], Array]] = {
   int(mujoco.mjtGeom.mjGEOM_BOX): box_shadow,
 }
 """Shadow test by ``mujoco.mjtGeom``."""
-
-
-def darkness(
-  geoms: Geoms,
-  casters: tuple[int, ...],
-  frames: Frames,
-  rays: Rays,
-  t: Array,
-  basis: Array,
-) -> Array:
-  """Returns bool[P]: any of the casters, given by MuJoCo id, darkens the point.
-
-  Raises:
-    ValueError: a caster is not drawn or is not a sphere, capsule or box.
-  """
-  dark = jnp.zeros(t.shape, bool)
-  for k in geoms.rows(casters, SHADOWS):
-    dark = dark | SHADOWS[int(geoms.types[k])](row(frames, k), rays, t, basis)
-  return dark

@@ -34,12 +34,7 @@ def _odd(x: Array) -> Array:
 
 
 def apply_texture(
-  frames: Frames,
-  texture: Texture,
-  cam_xmat: Array,
-  rays: Rays,
-  t: Array,
-  paint: Array,
+  frames: Frames, texture: Texture, cam_xmat: Array, rays: Rays, t: Array, paint: Array
 ) -> Array:
   """Returns the paint f32[P] with the texture at the visible points.
 

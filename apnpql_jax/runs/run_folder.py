@@ -254,7 +254,7 @@ def fresh_run_dir(run_dir: Path) -> Generator[Path, None, None]:
     yield run_dir
   except BaseException as error:
     # Refused, or stopped before anything was written: give back what was there.
-    if isinstance(error, FileError) or not (run_dir / CONFIG_FILE).exists():
+    if isinstance(error, UserError) or not (run_dir / CONFIG_FILE).exists():
       shutil.rmtree(run_dir, ignore_errors=True)
       if aside is not None:
         aside.rename(run_dir)

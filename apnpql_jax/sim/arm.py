@@ -100,14 +100,8 @@ def rotation_error(current: Array, target: Array) -> Array:
   """Returns the rotation vector f32[*b, 3] (rad, world) from current to target."""
   delta = target @ jnp.swapaxes(current, -1, -2)
   # The skew part of a rotation is sin(angle) * axis, its trace 1 + 2 cos(angle).
-  skew = 0.5 * jnp.stack(
-    [
-      delta[..., 2, 1] - delta[..., 1, 2],
-      delta[..., 0, 2] - delta[..., 2, 0],
-      delta[..., 1, 0] - delta[..., 0, 1],
-    ],
-    -1,
-  )
+  pairs = (2, 1), (0, 2), (1, 0)
+  skew = 0.5 * jnp.stack([delta[..., i, j] - delta[..., j, i] for i, j in pairs], -1)
   sine = jnp.sqrt((skew**2).sum(-1, keepdims=True) + 1e-12)
   cosine = 0.5 * (jnp.trace(delta, axis1=-2, axis2=-1)[..., None] - 1)
   return skew * jnp.arctan2(sine, cosine) / sine

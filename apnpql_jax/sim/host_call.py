@@ -51,9 +51,9 @@ def register(name: str, function: HostFunction) -> None:
     if frame.stage != _EXECUTE:
       return None
     try:
-      results = function(*map(_array, frame.arguments.buffers()))
-      for buffer, value in zip(frame.results.buffers(), results, strict=True):
-        _array(buffer)[...] = value
+      results = function(*_arrays(frame.arguments))
+      for array, value in zip(_arrays(frame.results), results, strict=True):
+        array[...] = value
       return None
     except BaseException:  # No exception may reach XLA.
       message = traceback.format_exc().encode()
@@ -81,8 +81,12 @@ def call(name: str, shapes: Sequence[Any], *arrays: Any) -> Sequence[Any]:
   return jax.pure_callback(host, tuple(shapes), *arrays)
 
 
+def _arrays(buffers: Any) -> list[np.ndarray]:
+  """Returns views of the buffers' memory."""
+  return [_array(buffers.pointers[i].contents) for i in range(buffers.count)]
+
+
 def _array(buffer: Any) -> np.ndarray:
-  """Returns a view of a buffer's memory."""
   if buffer.dtype != _F32:
     raise TypeError(f"expected an f32 buffer, got one of XLA type {buffer.dtype}")
   shape = tuple(buffer.dims[: buffer.rank])
@@ -92,78 +96,36 @@ def _array(buffer: Any) -> np.ndarray:
   return np.asarray((ctypes.c_float * size).from_address(buffer.data)).reshape(shape)
 
 
-class _Struct(ctypes.Structure):
-  """The fields that most structures begin with."""
-
-  _fields_ = (("size", c_size_t), ("extension", c_void_p))
+def _structure(name: str, **fields: Any) -> Any:
+  return type(name, (ctypes.Structure,), {"_fields_": list(fields.items())})
 
 
-class _Version(_Struct):
-  _fields_ = (("major", c_int), ("minor", c_int))
+_HEAD = {"size": c_size_t, "extension": c_void_p}
 
-
-class _Metadata(ctypes.Structure):
-  _fields_ = (("size", c_size_t), ("version", _Version))
-
-
-class _Extension(ctypes.Structure):
-  _fields_ = (
-    ("size", c_size_t),
-    ("kind", c_int),
-    ("next", c_void_p),
-    ("metadata", POINTER(_Metadata)),
-  )
-
-
-class _Buffer(_Struct):
-  _fields_ = (
-    ("dtype", c_int),
-    ("data", c_void_p),
-    ("rank", c_int64),
-    ("dims", POINTER(c_int64)),
-  )
-
-
-class _Buffers(_Struct):
-  """Arguments or results of a call."""
-
-  _fields_ = (
-    ("count", c_int64),
-    ("kinds", c_void_p),
-    ("pointers", POINTER(POINTER(_Buffer))),
-  )
-
-  def buffers(self) -> list[_Buffer]:
-    """Returns the buffers in order."""
-    return [self.pointers[i].contents for i in range(self.count)]
-
-
-class _ErrorArgs(_Struct):
-  _fields_ = (("message", c_char_p), ("code", c_int))
-
-
-class _Api(_Struct):
-  """The first fields of the structure."""
-
-  _fields_ = (
-    ("version", _Version),
-    ("internal", c_void_p),
-    ("create_error", CFUNCTYPE(c_void_p, POINTER(_ErrorArgs))),
-  )
-
-
-class _CallFrame(ctypes.Structure):
-  """The first fields of the structure."""
-
-  _fields_ = (
-    ("size", c_size_t),
-    ("extension", POINTER(_Extension)),
-    ("api", POINTER(_Api)),
-    ("context", c_void_p),
-    ("stage", c_int),
-    ("arguments", _Buffers),
-    ("results", _Buffers),
-  )
-
-
+_Version = _structure("Version", **_HEAD, major=c_int, minor=c_int)
+_Metadata = _structure("Metadata", size=c_size_t, version=_Version)
+_Extension = _structure(
+  "Extension", size=c_size_t, kind=c_int, next=c_void_p, metadata=POINTER(_Metadata)
+)
+_Buffer = _structure(
+  "Buffer", **_HEAD, dtype=c_int, data=c_void_p, rank=c_int64, dims=POINTER(c_int64)
+)
+_Buffers = _structure(  # arguments or results of a call
+  "Buffers", **_HEAD, count=c_int64, kinds=c_void_p, pointers=POINTER(POINTER(_Buffer))
+)
+_ErrorArgs = _structure("ErrorArgs", **_HEAD, message=c_char_p, code=c_int)
+_CreateError = CFUNCTYPE(c_void_p, POINTER(_ErrorArgs))
+_Api = _structure(  # the first fields
+  "Api", **_HEAD, version=_Version, internal=c_void_p, create_error=_CreateError
+)
+_CallFrame = _structure(  # the first fields
+  "CallFrame",
+  size=c_size_t,
+  extension=POINTER(_Extension),
+  api=POINTER(_Api),
+  context=c_void_p,
+  stage=c_int,
+  arguments=_Buffers,
+  results=_Buffers,
+)
 _Handler = CFUNCTYPE(c_void_p, POINTER(_CallFrame))

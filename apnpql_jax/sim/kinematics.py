@@ -13,6 +13,8 @@ from apnpql_jax.sim.physics import PhysicsState, model_fields
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
 
+_POSES = ("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat")
+
 
 class Kinematics(struct.PyTreeNode):
   """World poses of geoms, sites and cameras by MuJoCo id; positions in m."""
@@ -39,14 +41,7 @@ def make_kinematics(scene: Scene) -> Callable[[PhysicsState], Kinematics]:
       qpos=state.qpos, mocap_pos=state.mocap_pos, mocap_quat=state.mocap_quat
     )
     data = mjx.camlight(world, mjx.kinematics(world, data))
-    return Kinematics(
-      geom_xpos=data.geom_xpos,
-      geom_xmat=data.geom_xmat,
-      site_xpos=data.site_xpos,
-      site_xmat=data.site_xmat,
-      cam_xpos=data.cam_xpos,
-      cam_xmat=data.cam_xmat,
-      fields=state.fields,
-    )
+    poses = {name: getattr(data, name) for name in _POSES}
+    return Kinematics(**poses, fields=state.fields)
 
   return jax.vmap(kinematics)

@@ -18,31 +18,22 @@ from apnpql_jax.types import Array
 
 MAX_VELOCITY = 1.0
 """rad/s; the paper's "m/s" can only mean joint space."""
-
 MAX_ACCELERATION = 1.2
 """rad/s^2 (paper Sec. V-A)."""
-
 VELOCITY_GAIN = 25.0
 """1/s; brings a joint to the desired velocity well within one 0.15 s period."""
-
 GRIPPER_SPEED = 0.075
 """m/s of pad gap: the closing speed in the manufacturer's manual."""
-
 GRIPPER_GAIN = 10.0
 """N m s/rad, half of what is stable for the coupled fingers at 5 ms steps."""
-
 GRIPPER_TORQUE = 3.5
 """N m, as in the manufacturer's model: 30-60 N per pad."""
-
 FINGER_LENGTH = 0.057
 """m; with FINGER_ANGLE the closed form gap(q) = 2 (4.1 mm + L cos(q + 30 deg))."""
-
 FINGER_ANGLE = np.pi / 6
-
 START_TIME = 1.0
 """s; clocks start above zero. C MuJoCo sets the clock of a world that it resets to
 zero, so a reset shows even in the first period."""
-
 STATE_FIELDS = ("qpos", "qvel", "qacc_warmstart", "mocap_pos", "mocap_quat", "time")
 """Fields of ``PhysicsState`` that MuJoCo's data has too."""
 

@@ -74,15 +74,9 @@ class TableTask:
     *mocap: tuple[int, np.ndarray, np.ndarray | float],
     variant: np.ndarray | int = 0,
   ) -> ResetDraw:
-    """Completes a draw.
-
-    Args:
-      qpos: f64[n, nq].
-      mocap: index, horizontal position f64[n, 2] (m) and yaw f64[n] (rad) of bodies.
-      variant: i64[n], of the scene.
-    """
-    shape = (len(qpos), self.scene.model.nmocap)
-    pos, quat = np.zeros((*shape, 3)), np.zeros((*shape, 4))
+    """Completes qpos f64[n, nq] by index, xy and yaw of mocap bodies, and variants."""
+    pos = np.zeros((len(qpos), self.scene.model.nmocap, 3))
+    quat = np.zeros((*pos.shape[:2], 4))
     for index, xy, yaw in mocap:
       pos[:, index, :2], quat[:, index] = xy, yaw_quat(np.broadcast_to(yaw, len(qpos)))
     return ResetDraw(qpos, pos, quat, np.broadcast_to(variant, len(qpos)).astype(int))
@@ -102,17 +96,12 @@ def draw_pair(
   min_distance: float,
   to_xy: Callable[[np.ndarray], np.ndarray] = lambda spots: spots,
 ) -> np.ndarray:
-  """Draws pairs of spots, uniform among those that are far enough apart.
+  """Draws pairs of spots, uniform among those at least ``min_distance`` (m) apart.
 
-  Args:
-    rng: random numbers.
-    count: number of pairs n.
-    ranges: ranges of the two coordinates of a spot.
-    min_distance: m, between the spots of a pair.
-    to_xy: maps coordinates to x and y (m), both f64[2, m, 2].
+  ``ranges`` limit the coordinates of a spot, which ``to_xy`` converts to x and y.
 
   Returns:
-    f64[2, n, 2], x and y of the two spots, m.
+    f64[2, count, 2], x and y of both spots, m.
   """
   low, high = np.array(ranges).T
   pair = to_xy(rng.uniform(low, high, (2, count, 2)))

@@ -30,42 +30,24 @@ from apnpql_jax.tasks.base import FreeBody, TableTask, draw_pair
 from apnpql_jax.tasks.task import ResetDraw, ToolTargets, register_task
 from apnpql_jax.types import Array
 
+# Sides, half the width across them in m, height in m of the three cups. Taller than a
+# mug: gripped in the middle, the hand must clear the table by its 27 mm and, at the
+# goal, by the 58 mm of the camera below it.
 SHAPES = ((8, 0.030, 0.130), (8, 0.037, 0.140), (4, 0.033, 0.150))
-"""Sides, half the width across them in m, height in m of the three cups. Taller than
-a mug: gripped in the middle, the hand must clear the table by its 27 mm and, at the
-goal, by the 58 mm of the camera below it."""
-
+# m and rad; distance from the base's axis and direction of cup and goal. Nearer to the
+# base, wrist 2 would be straight while the hand stands off the cup.
 RANGE = ((0.48, 0.60), (-0.5, 0.5))
-"""m and rad; distance from the base's axis and direction of cup and goal. Nearer to
-the base, wrist 2 would be straight while the hand stands off the cup."""
-
-MAX_YAW = 0.3
-"""rad; largest yaw of the cup away from the direction of reach."""
-
-MIN_DISTANCE = 0.16
-"""m between cup and goal: the mark clears the widest cup."""
-
+MAX_YAW = 0.3  # rad; largest yaw of the cup away from the direction of reach
+MIN_DISTANCE = 0.16  # m between cup and goal: the mark clears the widest cup
+# kg, of a plastic cup (YCB: 13 to 38 g). In a horizontal tool it loads wrist 1 with
+# 0.06 N m, of the 0.14 N m that the limit of acceleration leaves it.
 MASS = 0.025
-"""kg, of a plastic cup (YCB: 13 to 38 g). In a horizontal tool it loads wrist 1 with
-0.06 N m, of the 0.14 N m that the limit of acceleration leaves it."""
-
-STANDOFF = 0.09
-"""m; this far behind the cup the open fingers are clear of it."""
-
-LIFT = 0.07
-"""m; carrying height: turning cup and fingers reach down 100 mm."""
-
-FREE = 0.06
-"""m; from this height on the cup is turned and moved at full speed."""
-
-GOAL_TOLERANCE = 0.03
-"""m between the centers of cup and goal."""
-
-UPRIGHT = 0.97
-"""Cosine of the largest tilt of a cup that stands: 14 degrees."""
-
-CLEAR = 0.05
-"""m; the gripper has let go when its pinch point is this far from the cup's axis."""
+STANDOFF = 0.09  # m; this far behind the cup the open fingers are clear of it
+LIFT = 0.07  # m; carrying height: turning cup and fingers reach down 100 mm
+FREE = 0.06  # m; from this height on the cup is turned and moved at full speed
+GOAL_TOLERANCE = 0.03  # m between the centers of cup and goal
+UPRIGHT = 0.97  # cosine of the largest tilt of a cup that stands: 14 degrees
+CLEAR = 0.05  # m from the cup to the pinch point of a hand that has let go
 
 
 def shape_cup(spec: mujoco.MjSpec, sides: int, half: float, height: float) -> None:

@@ -10,16 +10,13 @@ from jaxtyping import Bool, Float
 
 from apnpql_jax.types import Array
 
+# m/s; above float32 contact noise, and slow enough to stop within a millimeter: v^2 / 2
+# mu g is 0.7 mm at mu = 0.2.
 REST_SPEED = 0.05
-"""m/s; above float32 contact noise, and slow enough to stop within a millimeter:
-v^2 / 2 mu g is 0.7 mm at mu = 0.2."""
-
-REST_TURN = 0.5
-"""rad/s."""
-
+REST_TURN = 0.5  # rad/s
+# m; a direction is observed as a point this far away, so that a turn by a few degrees
+# weighs as much as a few centimeters.
 POINTER = 0.2
-"""m; a direction is observed as a point this far away, so that a turn by a few
-degrees weighs as much as a few centimeters."""
 
 
 def norm(x: Float[Array, "*b n"]) -> Float[Array, "*b"]:

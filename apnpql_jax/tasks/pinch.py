@@ -17,28 +17,18 @@ Mask = Bool[Array, " worlds"]
 Angle = Float[Array, " worlds"]
 Point = Float[Array, "worlds 3"]
 
-TOLERANCE = 0.004
-"""m; how far the pads' gap may be from an object's width while they hold it."""
-
-CLEARANCE = 0.02
-"""m; spare room of an open hand, both sides together."""
-
+TOLERANCE = (
+  0.004  # m; largest difference between the gap and the width of a held object
+)
+CLEARANCE = 0.02  # m; spare room of an open hand, both sides together
+# m; the hand may close when its pinch point is this close to the grasp. The closing
+# pads center what stands freely, and a policy with a pixel per centimeter hardly comes
+# closer.
 NEAR = 0.012
-"""m; the hand may close when its pinch point is this close to the grasp. The closing
-pads center what stands freely, and a policy that sees a pixel per centimeter hardly
-comes closer."""
-
-LOST = 0.025
-"""m; what is further from the pinch point is not in the hand."""
-
-STRAIGHT = 0.25
-"""rad; the hand may close when twisted by less: the pads turn what stands freely."""
-
-ALIGNED, FUNNEL = 0.012, 0.05
-"""m; the tool goes in fully within the first, stays out beyond the second."""
-
-LEVER = 0.05
-"""m/rad; a twist of the fingers beyond half of what is allowed counts as an offset."""
+LOST = 0.025  # m; an object further from the pinch point is not in the hand
+STRAIGHT = 0.25  # rad; largest twist of a closing hand: the pads turn what is free
+ALIGNED, FUNNEL = 0.012, 0.05  # m; offsets up to which the tool goes in fully, at all
+LEVER = 0.05  # m/rad; offset that a twist beyond half of the allowed one counts as
 
 
 @dataclasses.dataclass
@@ -113,7 +103,7 @@ class Pinch:
     down = geometry.at_height(aim[:, :2], aim[:, 2] - self.depth + height)
     return self._rise_first(tool, aim, down)
 
-  def above(self, kinematics: Kinematics, place: Point) -> Point:
+  def go_above(self, kinematics: Kinematics, place: Point) -> Point:
     """Returns the tool position (m) high over a place; a low tool rises first."""
     tool = kinematics.site_xpos[:, self.scene.tool_site]
     return self._rise_first(tool, place, geometry.at_height(place[:, :2], self.travel))

@@ -26,49 +26,25 @@ from apnpql_jax.tasks.pinch import ALIGNED, FUNNEL, Pinch, grip, pick_and_place
 from apnpql_jax.tasks.task import ResetDraw, ToolTargets, register_task
 from apnpql_jax.types import Array
 
+# m; x and y ranges of the holder and the box, within reach of a vertical tool.
 WORKSPACE = ((0.40, 0.52), (-0.22, 0.22))
-"""m; x and y ranges of the holder and the box, within reach of a vertical tool."""
-
-HOLDER_YAW, BOX_YAW = 0.5, 0.3
-"""rad; largest yaw of each."""
-
-MIN_DISTANCE = 0.26
-"""m between holder and box: half the box's diagonal (154 mm), the plate, fingers."""
-
-THICKNESS = 0.012
-"""m; of the plate."""
-
-RADIUS = 0.0647
-"""m; from the plate's center to the middle of a side of its octagon."""
-
-GRASP_INSET = 0.013
-"""m from the plate's edge to the pads' center: the pads are 20 mm long."""
-
-HOVER = 0.06
-"""m; height over the grasp at which the open finger tips clear the plate."""
-
-TRAVEL = 0.22
-"""m; tool height at which closed fingers clear the standing plate (135 mm)."""
-
+HOLDER_YAW, BOX_YAW = 0.5, 0.3  # rad; largest yaw of each
+MIN_DISTANCE = 0.26  # m; half the box's diagonal (154 mm), the plate and fingers
+THICKNESS = 0.012  # m; of the plate
+RADIUS = 0.0647  # m; from the plate's center to the middle of a side of its octagon
+GRASP_INSET = 0.013  # m from the edge to the center of the pads, which are 20 mm long
+HOVER = 0.06  # m; height over the grasp at which the open finger tips clear the plate
+TRAVEL = 0.22  # m; tool height at which closed fingers clear the plate (135 mm)
+# m and rad; closer than for what stands freely: in the holder the pads can neither
+# center nor turn the plate.
 NEAR, STRAIGHT = 0.01, 0.12
-"""m and rad; closer than for what stands freely: in the holder the pads can neither
-center nor turn the plate."""
-
-LIFT = 0.085
-"""m; carrying height of the swinging plate: jaws and walls are 35 and 40 mm high."""
-
-FREE = 0.04
-"""m; from this height on the plate moves sideways at full speed."""
-
-INSIDE = (0.12, 0.085)
-"""m; half the inner length and width of the box."""
-
-ON_FLOOR = 0.012
-"""m; largest height of the plate's lowest point at success."""
-
+LIFT = 0.085  # m; carrying height of a swinging plate over jaws and walls (35, 40 mm)
+FREE = 0.04  # m; from this height on the plate moves sideways at full speed
+INSIDE = (0.12, 0.085)  # m; half the inner length and width of the box
+ON_FLOOR = 0.012  # m; largest height of the plate's lowest point at success
+# m; the gripper has let go when its pinch point is this far outside the circle of
+# grasps on the plate.
 CLEAR = 0.05
-"""m; the gripper has let go when its pinch point is this far outside the circle of
-grasps on the plate."""
 
 
 @register_task
@@ -121,7 +97,7 @@ class PlacePlate(TableTask):
     free = ((plate[:, 2] - RADIUS - 0.005) / (FREE - 0.005)).clip(0.0, 1.0)
     free = jnp.maximum(free, 1.0 - far)  # It may be low near its place.
     carry = tool + geometry.at_height(free[:, None] * shift[:, :2], climb)
-    to_goal = jnp.where(held[:, None], carry, self._hand.above(kinematics, goal))
+    to_goal = jnp.where(held[:, None], carry, self._hand.go_above(kinematics, goal))
 
     # A plate that is still in its holder must not be turned.
     box_yaw = geometry.yaw(state.mocap_quat[:, self._goal])

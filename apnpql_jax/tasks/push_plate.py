@@ -25,47 +25,25 @@ from apnpql_jax.tasks.base import FreeBody, TableTask, draw_pair, yaw_quat
 from apnpql_jax.tasks.task import ResetDraw, ToolTargets, register_task
 from apnpql_jax.types import Array
 
+# m; x and y ranges of plate and goal, within reach of a vertical tool.
 WORKSPACE = ((0.36, 0.58), (-0.24, 0.24))
-"""m; x and y ranges of plate and goal, within reach of a vertical tool."""
-
-MIN_DISTANCE = 0.12
-"""m between plate and goal: four times the goal's tolerance."""
-
-GOAL_TOLERANCE = 0.03
-"""m; the mark's radius exceeds the plate's by this much: solved = inside the mark."""
-
+MIN_DISTANCE = 0.12  # m between plate and goal: four times the goal's tolerance
+GOAL_TOLERANCE = 0.03  # m; the mark's radius minus the plate's: inside is solved
+# Cosine of the largest tilt of a plate that lies flat: 14 degrees. Height alone does
+# not exclude a plate upside down, because only its floor touches the table.
 FLAT = 0.97
-"""Cosine of the largest tilt of a plate that lies flat: 14 degrees. Height alone does
-not exclude a plate upside down, because only its floor touches the table."""
-
-HOVER_HEIGHT = 0.08
-"""m; tool height at which the finger tips clear the rim (34 mm)."""
-
-CLEAR = 0.05
-"""m; above this the tool may travel without touching the rim."""
-
-DRAG_HEIGHT = 0.012
-"""m; 6 mm above the plate's floor, the tips' sides against the rim."""
-
-LOW = 0.03
-"""m; below this the tips are behind the rim (center line at 22 mm): dragging starts."""
-
-INSIDE = 0.083
-"""m; radius of the rim's center line: a low tool closer than this is inside."""
-
+HOVER_HEIGHT = 0.08  # m; tool height at which the finger tips clear the rim (34 mm)
+CLEAR = 0.05  # m; above this the tool may travel without touching the rim
+DRAG_HEIGHT = 0.012  # m; 6 mm above the plate's floor, the tips' sides against the rim
+LOW = 0.03  # m; the tips drag below this, behind the rim (center line at 22 mm)
+INSIDE = 0.083  # m; radius of the rim's center line
+# m; a tool below this and within the rim goes down to drag under either primitive. Well
+# above the drag height, because a policy that misjudges where the primitives reverse
+# would lift the tool off the plate.
 CAPTURE = 0.06
-"""m; a tool below this and within the rim goes down to drag under either primitive.
-Well above the drag height, because a policy that misjudges where the primitives reverse
-would lift the tool off the plate."""
-
-ALIGNED = 0.02
-"""m; this close to the plate's axis the tool descends: 33 mm between tips and rim."""
-
-FUNNEL = 0.055
-"""m; the height falls linearly from here to ``ALIGNED``."""
-
-LOOKAHEAD = 0.07
-"""m; longest step of a dragging tool's waypoint."""
+ALIGNED = 0.02  # m; the tool descends this close to the axis, 33 mm from the rim
+FUNNEL = 0.055  # m; the height falls linearly from here to ``ALIGNED``
+LOOKAHEAD = 0.07  # m; longest step of a dragging tool's waypoint
 
 
 @register_task

@@ -24,35 +24,17 @@ from apnpql_jax.tasks.pinch import ALIGNED, FUNNEL, Pinch, grip, pick_and_place
 from apnpql_jax.tasks.task import ResetDraw, ToolTargets, register_task
 from apnpql_jax.types import Array
 
+# m; x and y ranges of both boxes, within reach of a vertical tool.
 WORKSPACE = ((0.38, 0.56), (-0.22, 0.22))
-"""m; x and y ranges of both boxes, within reach of a vertical tool."""
-
-MAX_YAW = 0.25
-"""rad; largest yaw of a box."""
-
-MIN_DISTANCE = 0.13
-"""m between the boxes: open fingers (107 mm) around one clear the other."""
-
-SIDE = 0.05
-"""m; edge of a box."""
-
-HOVER = 0.07
-"""m; height over the grasp at which the open finger tips clear the box."""
-
-TRAVEL = 0.14
-"""m; tool height at which closed fingers clear everything."""
-
-LIFT = 0.05
-"""m; clearance of the carried box over the blue one."""
-
-STACKED_OFF = 0.02
-"""m; horizontal offset of the centers at success: under half a side, so it stands."""
-
-STACKED_HEIGHT = 0.005
-"""m; tolerance of the height difference, which is one side."""
-
-CLEAR = 0.05
-"""m; the gripper has let go when the tool is this far from the box."""
+MAX_YAW = 0.25  # rad; largest yaw of a box
+MIN_DISTANCE = 0.13  # m; open fingers (107 mm) around one box clear the other
+SIDE = 0.05  # m; edge of a box
+HOVER = 0.07  # m; height over the grasp at which the open finger tips clear the box
+TRAVEL = 0.14  # m; tool height at which closed fingers clear everything
+LIFT = 0.05  # m; clearance of the carried box over the blue one
+STACKED_OFF = 0.02  # m; largest offset at success: under half a side, so it stands
+STACKED_HEIGHT = 0.005  # m; tolerance of the height difference, which is one side
+CLEAR = 0.05  # m; the gripper has let go when the tool is this far from the box
 
 
 @register_task
@@ -94,7 +76,7 @@ class StackBox(TableTask):
     over = geometry.funnel(off, aligned=ALIGNED / 2, wide=FUNNEL)
     climb = SIDE + 0.001 + LIFT * over
     onto = tool + shift + geometry.at_height(0 * shift[:, :2], climb)
-    to_goal = jnp.where(held[:, None], onto, self._hand.above(kinematics, blue))
+    to_goal = jnp.where(held[:, None], onto, self._hand.go_above(kinematics, blue))
 
     positions = self.with_neutral(to_object, to_goal)
     turns = jnp.stack([yaw, yaw * held, 0 * yaw], 1)

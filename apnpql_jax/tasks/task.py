@@ -45,24 +45,20 @@ class Task(Protocol):
 
   def sample_resets(self, rng: np.random.Generator, count: int) -> ResetDraw:
     """Draws initial states uniformly within the task's ranges, without overlaps."""
-    ...
 
   def tool_targets(self, state: PhysicsState, kinematics: Kinematics) -> ToolTargets:
     """Returns where each action primitive leads the tool from the present state."""
-    ...
 
   def success(
     self, state: PhysicsState, kinematics: Kinematics
   ) -> Bool[Array, " worlds"]:
     """Checks whether the task is solved, which is rewarded once with +1."""
-    ...
 
   def objects(self, state: PhysicsState) -> Float[Array, "worlds 3*k"]:
     """Returns k points (m) that give the poses of objects and goals, for --obs state.
 
     A direction is given by the point ``geometry.POINTER`` away along it.
     """
-    ...
 
   def expert(
     self,
@@ -74,7 +70,6 @@ class Task(Protocol):
 
     ``primitives`` are the actions that follow each primitive.
     """
-    ...
 
 
 T = TypeVar("T", bound=Task)

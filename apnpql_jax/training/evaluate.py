@@ -1,4 +1,4 @@
-"""Held-out episodes: every world plays exactly one, from rows training never sees."""
+"""Evaluation on held-out episodes, whose reset states training never sees."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from apnpql_jax.training.rollout import (
 from apnpql_jax.training.video import record_episodes
 
 MAX_WORLDS = 64
-"""Episodes played at once; more are played in turn."""
+"""Episodes played in parallel; more are played in batches."""
 
 
 def play_held_out(
@@ -37,22 +37,22 @@ def play_held_out(
 ) -> Episodes:
   """Plays ``episodes`` held-out episodes.
 
-  The rows are a random order of all held-out ones, repeated if there are not enough.
+  Their rows of the bank are random permutations of all held-out rows.
 
   Returns:
-    the episodes; the first of them can be filmed.
+    The episodes, with the states of the first of them.
   """
   key = jax.random.key(seed)
   rng = np.random.default_rng(seed)
   orders = [rng.permutation(env.held_out) for _ in range(-(-episodes // env.held_out))]
   rows = env.bank_split + np.concatenate(orders)[:episodes]
-  turns = math.ceil(episodes / MAX_WORLDS)
-  size = math.ceil(episodes / turns)
-  # The last turn is filled up, so that one compiled size serves all.
-  padded = np.resize(rows, turns * size).reshape(turns, size)
+  batches = math.ceil(episodes / MAX_WORLDS)
+  size = math.ceil(episodes / batches)
+  # The last batch is padded, so that all have one compiled size.
+  padded = np.resize(rows, batches * size).reshape(batches, size)
   played = [
-    play(params, jnp.asarray(r), jax.random.fold_in(key, i))
-    for i, r in enumerate(padded)
+    play(params, jnp.asarray(batch), jax.random.fold_in(key, i))
+    for i, batch in enumerate(padded)
   ]
   success, length = (
     np.concatenate([np.asarray(getattr(p, f)) for p in played])[:episodes]
@@ -62,7 +62,7 @@ def play_held_out(
 
 
 def figures_of(played: Episodes) -> dict[str, Any]:
-  """episodes, successes, success_rate, ci95 (Wilson), mean_length (control periods)."""
+  """Returns counts, success rate, ci95 (Wilson) and mean length in control periods."""
   episodes, successes = len(played.success), int(played.success.sum())
   return {
     "episodes": episodes,
@@ -86,17 +86,19 @@ def evaluate(
   """Plays held-out episodes with a checkpoint of a run.
 
   Args:
-    run_dir: the run folder.
-    episodes: how many.
-    seed: of rows and actions.
-    backend: physics engine; the run's own if None.
-    step: of the checkpoint; the newest if None.
-    greedy: the candidate of highest value or, of a parametric policy, the mean acts.
-    video: where to write the first episodes as a video; if that fails, a line on
-      standard error says so.
+    run_dir: The run folder.
+    episodes: Number of episodes.
+    seed: Random seed of bank rows and actions.
+    backend: Physics engine; that of the run if None.
+    step: Step of the checkpoint; the newest if None.
+    greedy: Take the candidate of highest value, or a parametric policy's mean.
+    video: File for a video of the first episodes; failures to write are only printed.
+
+  Returns:
+    The success rate with its confidence interval, and what produced it.
 
   Raises:
-    ConfigError: not a run folder, or no readable checkpoint.
+    FileError: Not a run folder, or no readable checkpoint.
   """
   began = time.monotonic()
   config = run_folder.open_run(run_dir).config
@@ -136,7 +138,7 @@ def evaluate_expert(
   noise: float,
   video: Path | None = None,
 ) -> dict[str, Any]:
-  """Plays held-out episodes with the task's scripted expert; see ``evaluate_run``."""
+  """Plays held-out episodes with the task's scripted expert; see ``evaluate``."""
   began = time.monotonic()
   env = make_env(env_config)
   play = make_player(env, lambda _: expert_policy(env, noise=noise))
@@ -154,13 +156,13 @@ def evaluate_expert(
 def _figures(
   env: Env, play: Player, params: Any, *, episodes: int, seed: int, video: Path | None
 ) -> dict[str, Any]:
-  """Those of held-out episodes, of which the first are filmed if there is a path."""
+  """Returns the figures of held-out episodes; films the first ones if asked to."""
   played = play_held_out(env, play, params, episodes=episodes, seed=seed)
   figures = figures_of(played)
   if video is None:
     return figures
   try:
     return figures | {"video": str(record_episodes(env, played, video))}
-  except OSError as error:  # The figures took minutes.
+  except OSError as error:  # The figures took minutes; do not lose them.
     say(f"cannot write {video}: {error}")
     return figures | {"video": None}

@@ -1,4 +1,4 @@
-"""The expert's replay: from the scripted expert or from demonstrations."""
+"""The expert replay, filled by the scripted expert or from demonstrations."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from apnpql_jax.types import ACTION_DIM, Array, Slot
 ExpertReplay = Callable[[TrainConfig, Env, Array], Replay | None]
 
 CERTAIN = 100.0
-"""nats; log density of actions whose policy is not known: so high that Retrace does not
-correct for it but cuts the trace."""
+"""Log density in nats of actions of an unknown policy: so high that Retrace cuts the
+trace."""
 
 
 def example_slot(worlds: EnvState) -> Slot:
-  """Shapes and dtypes of one replay slot of one world."""
+  """Returns the shapes and dtypes of a replay slot of one world."""
   action: Any = jax.ShapeDtypeStruct((ACTION_DIM,), jnp.float32)
   log_prob: Any = jax.ShapeDtypeStruct((), jnp.float32)
   timestep = jax.tree.map(
@@ -43,20 +43,16 @@ def example_slot(worlds: EnvState) -> Slot:
 
 
 def empty_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:
-  """An expert's replay with nothing in it, for who needs its shapes only."""
+  """Returns an empty expert replay, to get its shapes."""
   del key
-  worlds = config.env.worlds
-  length = config.replay.expert_steps // worlds
-  if not length:
-    return None
+  worlds, length = config.env.worlds, _length(config)
   state = jax.eval_shape(env.reset, jnp.zeros(worlds, jnp.int32))
-  return replay.create(example_slot(state), length, worlds)
+  return replay.create(example_slot(state), length, worlds) if length else None
 
 
 def collect_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:
-  """The expert's replay: ``replay.expert_steps`` slots of its noisy episodes."""
-  worlds = config.env.worlds
-  length = config.replay.expert_steps // worlds
+  """Returns an expert replay of noisy episodes of the scripted expert."""
+  worlds, length = config.env.worlds, _length(config)
   if not length:
     return None
   policy = expert_policy(env, noise=config.replay.expert_noise)
@@ -73,7 +69,10 @@ def collect_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:
 
 
 def add_chunk(ring: Replay, before: EnvState, after: EnvState, chunk: Slot) -> Replay:
-  """Adds a chunk; of a world that broke in it, the episode and the rest is excluded."""
+  """Adds a chunk [time, worlds, ...] to a replay.
+
+  In worlds that became non-finite, excludes it and the episode before from sampling.
+  """
   steps = before.elapsed + chunk.action.shape[0]
   broken = after.faults > before.faults
   return replay.exclude(replay.add(ring, chunk), jnp.where(broken, steps, 0))
@@ -82,17 +81,15 @@ def add_chunk(ring: Replay, before: EnvState, after: EnvState, chunk: Slot) -> R
 def replay_from_demonstrations(
   demos: Demonstrations, config: TrainConfig, env: Env
 ) -> Replay:
-  """The expert's replay of ``replay.expert_steps`` slots, made from demonstrations.
+  """Returns an expert replay made from demonstrations.
 
-  Each column of the ring holds a stretch of them, one after the other; they are
-  repeated if there are not enough, and those too many are left out.
+  The columns of the ring hold consecutive stretches of them, repeated or cut off to
+  fill ``replay.expert_steps`` slots.
   """
-  worlds = config.env.worlds
-  length = config.replay.expert_steps // worlds
-  n = demos.instants
-  index = np.resize(np.arange(n), (worlds, length)).T
+  worlds, length = config.env.worlds, _length(config)
+  index = np.resize(np.arange(demos.instants), (worlds, length)).T
   fresh = demos.first[index]
-  fresh[0] = True  # A column may begin in the middle of an episode.
+  fresh[0] = True  # A column may begin within an episode.
   ends = np.append(demos.first[1:], True)[index]
   targets = np.zeros((length, worlds, 3, 6), np.float32)
   targets[fresh] = _solve_targets(demos, index[fresh], env)
@@ -121,7 +118,7 @@ def replay_from_demonstrations(
 
 
 def save_expert(path: Path, config: EnvConfig, **settings: Any) -> dict[str, Any]:
-  """``record_expert`` into a file."""
+  """Saves the episodes of ``record_expert`` and returns a summary."""
   demos = record_expert(make_env(config), **settings)
   period_s = config.control_period_s
   return demonstrations.save(path, demos, task=config.task, control_period_s=period_s)
@@ -130,10 +127,10 @@ def save_expert(path: Path, config: EnvConfig, **settings: Any) -> dict[str, Any
 def record_expert(
   env: Env, *, episodes: int, seed: int, noise: float
 ) -> Demonstrations:
-  """Episodes of the task's scripted expert, up to success or time-out.
+  """Returns episodes of the task's scripted expert, up to success or time-out.
 
-  They begin at rows of the bank that training sees. Those in which the world was not
-  finite are left out.
+  They start from training rows of the bank. Episodes that became non-finite are left
+  out.
   """
   policy = expert_policy(env, noise=noise)
   row_key, key = jax.random.split(jax.random.key(seed))
@@ -151,20 +148,22 @@ def record_expert(
     return jax.lax.scan(period, start, keys)[1]
 
   played = play(env.reset(rows), key)
-  state, action, last, faults = jax.tree.map(np.asarray, played)
-  end = last.argmax(0)  # The first last instant; all sound episodes end in time.
-  sound = last.any(0) & (faults[end, np.arange(episodes)] == 0)
-  inside = (np.arange(len(last))[:, None] <= np.where(sound, end, -1)).T
-  take = lambda x: np.moveaxis(x, 1, 0)[inside]  # noqa: E731 - a name for one index
-  first = np.zeros_like(inside)
-  first[:, 0] = True
-  variant = np.asarray(env.variant(rows))[:, None].repeat(len(last), 1)
-  return Demonstrations(
-    *(take(x) for x in (state.qpos, state.qvel, state.mocap_pos, state.mocap_quat)),
-    variant[inside],
-    take(action),
-    first[inside],
+  played = jax.tree.map(lambda x: np.moveaxis(np.asarray(x), 1, 0), played)
+  state, action, last, faults = played  # [episodes, time, ...]
+  end = last.argmax(1)  # The first end; every finite episode has one.
+  finite = last.any(1) & (faults[np.arange(episodes), end] == 0)
+  time = np.arange(last.shape[1])
+  inside = time <= np.where(finite, end, -1)[:, None]
+  variant, first = np.broadcast_arrays(
+    np.asarray(env.variant(rows))[:, None], time == 0
   )
+  arrays = state.qpos, state.qvel, state.mocap_pos, state.mocap_quat, variant, action
+  return Demonstrations(*(x[inside] for x in arrays), first[inside])
+
+
+def _length(config: TrainConfig) -> int:
+  """Returns the slots per world of the expert replay."""
+  return config.replay.expert_steps // config.env.worlds
 
 
 def _states(demos: Demonstrations, scene: Scene, rows: Array) -> PhysicsState:
@@ -178,7 +177,7 @@ def _states(demos: Demonstrations, scene: Scene, rows: Array) -> PhysicsState:
 
 
 def _solve_targets(demos: Demonstrations, rows: np.ndarray, env: Env) -> np.ndarray:
-  """f32[len(rows), 3, 6], where the primitives lead when an episode begins."""
+  """Returns f32[len(rows), 3, 6]: joint targets of the primitives at these rows."""
   unique, inverse = np.unique(rows, return_inverse=True)
   state = _states(demos, env.task.scene, jnp.asarray(unique))
   positions, rotations, _ = map(np.asarray, env.tool_targets(state))

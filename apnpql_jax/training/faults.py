@@ -1,11 +1,12 @@
-"""Updates that were not finite: when to stop for them, and how to repeat one.
+"""Updates that were not finite: stopping the run, and repeating one to debug it.
 
-A skipped update leaves the learner as it was, and its batch follows from its key: what
-is written is therefore exactly what went wrong.
+A skipped update leaves the learner unchanged, and its batch is a function of its key.
+The saved update is therefore exactly the one that failed.
 """
 
 from __future__ import annotations
 
+from collections.abc import Container
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +27,24 @@ from apnpql_jax.training.state import TrainState
 from apnpql_jax.types import Observation, Slot, TimeStep, Transition
 
 _MAX_BYTES = 2 << 30
-"""A batch of images and a learner take far less."""
+"""Limit of a file to read; a batch of images and a learner take far less."""
+
+_NESTED = {
+  "observation_tm1": Observation,
+  "observation_t": Observation,
+  "observation": Observation,
+  "timestep": TimeStep,
+  "window": Slot,
+}
+"""Types of the fields of a transition, and of these, that are not arrays."""
 
 
 def check(config: TrainConfig, state: TrainState, folder: RunFolder) -> None:
-  """Stops a run whose updates are skipped one after the other.
+  """Stops a run if its last ``max_skipped_updates`` updates were skipped.
 
   Raises:
-    RunStopped: the last ``max_skipped_updates`` were; the message names the file with
-      the batch, and the command that repeats the update.
+    RunStopped: They were; the message contains the command that repeats the last one
+      from a saved file.
   """
   skipped = int(state.faults.in_a_row)
   if skipped < config.max_skipped_updates:
@@ -50,7 +60,7 @@ def check(config: TrainConfig, state: TrainState, folder: RunFolder) -> None:
 
 
 def write(path: Path, config: TrainConfig, state: TrainState) -> None:
-  """Saves the learner, the batch and the key of the last update that was skipped."""
+  """Saves learner, batch and key of the last skipped update."""
   sample_key, learn_key = jax.random.split(state.faults.key)
   sample = make_sample(config, make_agent(config.agent))
   batch = sample(state.replay, state.expert_replay, sample_key)
@@ -63,26 +73,26 @@ def write(path: Path, config: TrainConfig, state: TrainState) -> None:
 
 
 def repeat(path: Path) -> dict[str, list[str]]:
-  """Takes the update of a file of ``write`` again, with the settings of its run.
+  """Repeats a saved update with the settings of its run.
 
   Returns:
-    names of what was not finite: in the batch, in the learner before and after the
-    update, and among the metrics.
+    Names of the arrays that are not finite in the batch, in the learner before and
+    after the update, and in the metrics.
 
   Raises:
-    FileError: it is no such file, or does not lie in its run folder.
+    FileError: The file was not made by ``write``, or is not in its run folder.
   """
   config = run_folder.load_run_config(path.absolute().parent.parent)
   arrays = npz.read(path, limit=_MAX_BYTES)
   agent = make_agent(config.agent)
   try:
-    batch = leaves.fill(_example_batch(arrays), _below("batch/", arrays))
+    batch = leaves.fill(_example(Transition, "batch", arrays), _below("batch/", arrays))
     learner = jax.eval_shape(agent.init, jax.random.key(0), batch.observation_tm1)
     learner = leaves.fill(learner, _below("learner/", arrays))
     key = jax.random.wrap_key_data(jnp.asarray(arrays["key"]))
     after, metrics = jax.jit(agent.update)(learner, batch, key)
   except (KeyError, TypeError, ValueError) as error:
-    raise FileError(f"{path} is no update of this run: {one_line(error)}") from None
+    raise FileError(f"{path} is not an update of this run: {one_line(error)}") from None
   return {
     "batch": _not_finite(batch),
     "learner_before": _not_finite(learner),
@@ -99,28 +109,18 @@ def _below(prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, jax.Array]:
   }
 
 
-def _example_batch(arrays: dict[str, np.ndarray]) -> Transition:
-  """A transition that has the modalities the file has."""
+def _example(kind: Any, path: str, names: Container[str]) -> Any:
+  """Returns a batch of placeholders, with the modalities that the file has."""
 
-  def observation(name: str) -> Observation:
-    fields = Observation.__dataclass_fields__
-    held: dict[str, Any]
-    held = {f: 0 if f"batch/{name}/{f}" in arrays else None for f in fields}
-    return Observation(**held)
+  def part(field: str) -> Any:
+    name = f"{path}/{field}"
+    if field == "window" and f"{name}/action" not in names:
+      return None
+    if field in _NESTED:
+      return _example(_NESTED[field], name, names)
+    return 0 if kind is not Observation or name in names else None
 
-  def filled(kind: Any, **given: Any) -> Any:
-    return kind(**dict.fromkeys(kind.__dataclass_fields__, 0) | given)
-
-  window = None
-  if "batch/window/action" in arrays:
-    seen = observation("window/timestep/observation")
-    window = filled(Slot, timestep=filled(TimeStep, observation=seen))
-  return filled(
-    Transition,
-    observation_tm1=observation("observation_tm1"),
-    observation_t=observation("observation_t"),
-    window=window,
-  )
+  return kind(**{field: part(field) for field in kind.__dataclass_fields__})
 
 
 def _not_finite(tree: Any) -> list[str]:

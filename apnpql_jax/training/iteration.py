@@ -1,4 +1,4 @@
-"""The state of a run and the one pure function that moves it on."""
+"""The training iteration: a pure function of the training state."""
 
 from __future__ import annotations
 
@@ -8,11 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.sharding import (
-  Mesh,
-  NamedSharding,
-  PartitionSpec,
-)
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from apnpql_jax.agents.learner import Agent
 from apnpql_jax.config.schema import TrainConfig
@@ -28,9 +24,9 @@ Iteration = Callable[[TrainState], tuple[TrainState, Metrics]]
 
 
 def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
-  """The jitted iteration (paper Algorithm 1): rollouts, then gradient steps.
+  """Returns the jitted iteration (paper Algorithm 1): rollouts, then gradient steps.
 
-  The state is donated: the caller must go on with the one returned.
+  It donates its argument, so callers must continue with the returned state.
   """
   sample = make_sample(config, agent, env.mesh)
 
@@ -67,13 +63,13 @@ def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
 
 
 def _update(agent, sample, ring, expert_replay, carry, key) -> Any:
-  """One update for ``scan``: it is skipped, and counted, if it is not finite."""
+  """Runs one update inside ``scan``; skips and counts it if it is not finite."""
   learner, faults = carry
   sample_key, learn_key = jax.random.split(key)
   batch = sample(ring, expert_replay, sample_key)
   updated, metrics = agent.update(learner, batch, learn_key)
-  # The norms of the gradients tell of all losses and parameters; a reward that is not
-  # finite, however, can get lost in the limits of the projection.
+  # Gradient norms cover all losses and parameters. A non-finite reward in the batch can
+  # vanish in the clipping of the projection.
   norms = {k: v for k, v in metrics.items() if k.startswith("grad_norm/")}
   ok = all_finite((batch, norms, updated.nu))
   learner = jax.tree.map(functools.partial(jnp.where, ok), updated, learner)
@@ -87,7 +83,7 @@ def _update(agent, sample, ring, expert_replay, carry, key) -> Any:
 def make_sample(
   config: TrainConfig, agent: Agent, mesh: Mesh | None = None
 ) -> Callable[..., Transition]:
-  """(replay, expert replay, key) -> the batch of one update, [B, ...]."""
+  """Returns a function (replay, expert replay, key) -> batch [B, ...] of an update."""
   draw = functools.partial(
     replay.sample_mixed,
     batch_size=config.replay.batch_size,
@@ -101,7 +97,8 @@ def make_sample(
     return draw
 
   def sample(*args: Any) -> Transition:
-    # Whole at first: XLA would split the draws too, and collect them piece by piece.
+    # Replicate the batch before splitting it: XLA would split the draws too and gather
+    # them piece by piece.
     whole = NamedSharding(mesh, PartitionSpec())
     return place(jax.lax.with_sharding_constraint(draw(*args), whole), mesh)
 
@@ -109,7 +106,7 @@ def make_sample(
 
 
 def all_finite(tree: Any) -> Array:
-  """bool[]: no leaf holds a NaN or an infinity."""
+  """Returns bool[]: whether no leaf contains a NaN or an infinity."""
   return jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(tree)]).all()
 
 

@@ -1,4 +1,4 @@
-"""What a run tells while it trains: metrics, progress, evaluations, curve and video."""
+"""Reports of a run while it trains: metrics, progress, evaluations, curve and video."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from apnpql_jax.training.state import TrainState
 from apnpql_jax.training.video import record_episodes
 
 EVAL_SEED = 1
-"""Evaluations during training always play the same held-out episodes."""
+"""Seed of evaluations during training, which all play the same held-out episodes."""
 
 
 class Silent:
-  """The reporter of processes that leave it to the first one."""
+  """The reporter of all processes but the first: it does nothing."""
 
   def __init__(self, folder: RunFolder):
-    """Nothing will be written into the folder."""
+    """Stores the folder; writes nothing."""
     self.folder = folder
     self.evaluation: dict[str, Any] = {}
 
@@ -42,7 +42,7 @@ class Silent:
 
 
 class Reporter:
-  """Metrics, progress, evaluation, curve and videos of a run."""
+  """The reporter of the first process."""
 
   def __init__(
     self,
@@ -53,7 +53,7 @@ class Reporter:
     writer: MetricWriter,
     progress: TrainProgress,
   ):
-    """Builds the player of evaluations; nothing is compiled yet."""
+    """Builds the player of evaluations without compiling it."""
     self._config, self._env, self.folder = config, env, folder
     self._writer, self._progress = writer, progress
     self._play = make_player(
@@ -63,7 +63,7 @@ class Reporter:
     self.evaluation: dict[str, Any] = {}
 
   def iteration(self, step: int, updates: int, metrics: dict[str, Any]) -> None:
-    """Writes the row of one iteration; blocks until it has been computed."""
+    """Writes the metrics of one iteration; blocks until they are computed."""
     metrics = jax.device_get(metrics)
     now = time.monotonic()
     seconds, self._lap = now - self._lap, now
@@ -79,7 +79,7 @@ class Reporter:
     self._writer.write(step, figures)
 
   def evaluate(self, step: int, state: TrainState, *, last: bool) -> float:
-    """Plays held-out episodes, writes their row, the curve and, at last, a video."""
+    """Plays held-out episodes; writes metrics, the curve and, at the end, a video."""
     began = time.monotonic()
     config, folder = self._config, self.folder
     params = devices.local(state.learner.target_params)

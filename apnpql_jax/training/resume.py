@@ -1,6 +1,6 @@
-"""Where a run goes on: its newest whole checkpoint, and what came after that.
+"""Resuming a run from its newest readable checkpoint.
 
-A checkpoint holds the training state as three items, so that the replay may be saved
+A checkpoint holds the training state as three items, so that the replay can be saved
 less often than the rest.
 """
 
@@ -20,7 +20,7 @@ from apnpql_jax.training.state import TrainState
 
 
 def to_items(state: TrainState, *, whole: bool) -> dict[str, Any]:
-  """The parts of a checkpoint; the replay, by far the largest, only if ``whole``."""
+  """Returns the items of a checkpoint; the replay, the largest, only if ``whole``."""
   rest = {name: getattr(state, name) for name in ("env", "key", "env_steps", "faults")}
   items: dict[str, Any] = {"learner": state.learner, "rest": rest}
   if whole:
@@ -29,26 +29,23 @@ def to_items(state: TrainState, *, whole: bool) -> dict[str, Any]:
 
 
 def restore(
-  config: TrainConfig, run_dir: Path, example: TrainState, say: Callable[[str], None]
+  config: TrainConfig, run_dir: Path, example: TrainState, warn: Callable[[str], None]
 ) -> TrainState:
-  """The newest state that can be read; undoes ``to_items``.
+  """Returns the newest training state that can be read; the inverse of ``to_items``.
 
-  Args:
-    config: as of ``checkpoint.restore``.
-    run_dir: the run folder.
-    example: the same state as ShapeDtypeStructs.
-    say: is told which checkpoints could not be used, and what is older than the rest.
+  Takes the state as ShapeDtypeStructs, and calls ``warn`` with a line for each damaged
+  checkpoint and for an older replay.
   """
   items = to_items(example, whole=True)
   found = checkpoint_reader.restore(run_dir, None, items, config=config)
   for line in found.damaged:
-    say(line)
+    warn(line)
   if found.damaged:
-    say(f"going on from the checkpoint before, {found.step}")
+    warn(f"resuming from the checkpoint of step {found.step:,} instead")
   ring = found.items["replay"]["agent"]
   if found.steps["replay"] < found.step:
-    say(f"its replay is that of step {found.steps['replay']:,}")
-    # What comes next does not follow on its newest slots.
+    warn(f"its replay is that of step {found.steps['replay']:,}")
+    # The next slots do not continue its newest ones.
     ring = replay.exclude(ring, jnp.ones(config.env.worlds, jnp.int32))
   return TrainState(
     learner=found.items["learner"],
@@ -59,13 +56,12 @@ def restore(
 
 
 def set_aside(run_dir: Path, step: int) -> Path | None:
-  """Puts away checkpoints after ``step``: their future will now be another one.
+  """Moves checkpoints after ``step`` and a copy of the metrics to a folder of the run.
 
-  With the metrics so far they move to a folder of the run, in place of what an earlier
-  resume put there.
+  Replaces what an earlier resume put there.
 
   Returns:
-    the folder; None, and nothing is done, if there are no such checkpoints.
+    The folder, or None if there are no such checkpoints.
   """
   later = [number for number in checkpoint_reader.all_steps(run_dir) if number > step]
   if not later:

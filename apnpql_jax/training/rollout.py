@@ -1,4 +1,4 @@
-"""Policies at work in the worlds: loops over time, batched over worlds."""
+"""Rollouts of policies: loops over time, batched over worlds."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.types import ARM_DOF, Array, Slot
 
 Policy = Callable[[EnvState, Array], tuple[Array, Array]]
-"""(worlds, key) -> actions f32[worlds, 7], their log densities f32[worlds]."""
+"""(worlds, key) -> actions f32[worlds, 7], log densities f32[worlds]."""
 
 FILMED = 4
-"""Episodes of a batch that can be filmed: the first ones."""
+"""Number of episodes, the first of a batch, whose states are kept for a video."""
 
 _LEAST_NOISE = 1e-6
-"""Deviation in rad/s that stands for none: its density outweighs any policy's."""
+"""Standard deviation in rad/s for zero noise; denser than any policy."""
 
 
 def agent_policy(agent: Agent, params: Params, *, greedy: bool) -> Policy:
-  """The learned policy; sees observations only."""
+  """Returns the learned policy, which depends on observations only."""
 
   def policy(state: EnvState, key: Array) -> tuple[Array, Array]:
     action, info = agent.act(params, state.observation, key, greedy)
@@ -37,11 +37,9 @@ def agent_policy(agent: Agent, params: Params, *, greedy: bool) -> Policy:
 
 
 def expert_policy(env: Env, *, noise: float) -> Policy:
-  """The scripted expert with Gaussian noise on its joint velocities.
+  """Returns the task's scripted expert with Gaussian noise on its joint velocities.
 
-  Args:
-    env: the worlds, whose task knows the expert.
-    noise: standard deviation, rad/s.
+  ``noise`` is its standard deviation in rad/s.
   """
 
   def policy(state: EnvState, key: Array) -> tuple[Array, Array]:
@@ -63,7 +61,7 @@ def rollout(
   """Plays ``length`` control periods in every world, episode after episode.
 
   Returns:
-    the worlds afterwards, and what was seen and done, leaves [length, worlds, ...].
+    The worlds afterwards, and the slots with leaves [length, worlds, ...].
   """
 
   def period(state: EnvState, key: Array) -> tuple[EnvState, Slot]:
@@ -80,7 +78,7 @@ class Episodes(struct.PyTreeNode):
 
   success: Array  # bool[worlds]
   length: Array  # i32[worlds]: control periods until success or time-out
-  states: PhysicsState  # [time, <= FILMED, ...]: instants 0 to ``length`` of the first
+  states: PhysicsState  # [time, <= FILMED, ...]: time steps 0 to ``length``
 
 
 Player = Callable[[Any, Array, Array], Episodes]
@@ -88,9 +86,9 @@ Player = Callable[[Any, Array, Array], Episodes]
 
 
 def make_player(env: Env, make_policy: Callable[[Any], Policy]) -> Player:
-  """A jitted function that plays one episode per row and stops when all are over.
+  """Returns a jitted function that plays one episode per row until all are over.
 
-  What a world does after a fault is not counted.
+  A world that becomes non-finite counts as failed.
   """
 
   @jax.jit

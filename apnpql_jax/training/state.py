@@ -1,4 +1,4 @@
-"""The state of a run: everything needed to go on."""
+"""The training state."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from apnpql_jax.types import Array
 
 
 class Faults(struct.PyTreeNode):
-  """Updates that were skipped because something in them was not finite."""
+  """Updates skipped because they were not finite."""
 
-  in_a_row: Array  # i32[]: those at the end of what has been done so far
-  key: Array  # typed PRNG key of the last one, from which it can be repeated
+  in_a_row: Array  # i32[]: consecutive ones, up to now
+  key: Array  # typed PRNG key of the last one, to repeat it
 
 
 class TrainState(struct.PyTreeNode):
-  """Everything needed to go on."""
+  """Everything needed to resume a run."""
 
   learner: LearnerState
   env: EnvState  # [worlds, ...]
@@ -39,7 +39,7 @@ class TrainState(struct.PyTreeNode):
 def initial_state(
   config: TrainConfig, env: Env, agent: Agent, expert: ExpertReplay
 ) -> TrainState:
-  """The state before the first iteration; ``expert`` fills the expert's replay."""
+  """Returns the state of a new run; ``expert`` makes the expert replay."""
   keys = jax.random.split(jax.random.key(config.seed), 5)
   key, row_key, init_key, expert_key, fault_key = keys
   rows = jax.random.randint(row_key, (config.env.worlds,), 0, env.bank_split)
@@ -62,12 +62,12 @@ def initial_state(
 
   state = start(env.reset(rows), key, init_key, fault_key)
   state = state.replace(expert_replay=expert(config, env, expert_key))
-  # Bound to its devices, as a restored state is, so that both make the same program.
+  # Committed to its devices like a restored state, so that both use one compilation.
   return jax.device_put(state, shardings(state, env.mesh))
 
 
 def example_state(config: TrainConfig, env: Env, agent: Agent) -> TrainState:
-  """Shapes, dtypes and devices of the state, without taking memory for it."""
+  """Returns shapes, dtypes and shardings of the state without allocating it."""
   state = jax.eval_shape(lambda: initial_state(config, env, agent, empty_expert))
   return jax.tree.map(
     lambda x, where: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=where),

@@ -1,6 +1,6 @@
-"""The host loop around the jitted iteration: report, evaluate, save, stop cleanly.
+"""Training loop on the host: iterates, reports, evaluates, saves and stops cleanly.
 
-Everything needed to go on is in ``TrainState``; nothing here is.
+It keeps no state; everything needed to resume is in ``TrainState``.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ from apnpql_jax.training.state import TrainState, example_state, initial_state
 
 @dataclasses.dataclass(frozen=True)
 class Start:
-  """A run about to go on."""
+  """A run ready to train."""
 
   env: Env
   agent: Agent
   folder: RunFolder
   state: TrainState
   resume_step: int | None
-  """Step it goes on from; None if it is new."""
+  """Step to resume from; None for a new run."""
 
 
 def train(
@@ -58,39 +58,38 @@ def train(
   overwrite: bool = False,
   mesh: Mesh | None = None,
 ) -> dict[str, Any]:
-  """Trains to ``config.total_steps``, or until a signal, then saves.
+  """Trains to ``config.total_steps`` or until a signal, then saves.
 
   Args:
-    config: everything that decides the run.
-    run_dir: the run folder.
-    resume: go on from the newest checkpoint of ``run_dir`` that is whole.
-    overwrite: replace the run that ``run_dir`` holds, once the new one can start.
-    mesh: the devices to train on; the default one if None.
+    config: Settings of the run.
+    run_dir: The run folder.
+    resume: Resume from the newest readable checkpoint in ``run_dir``.
+    overwrite: Replace the run in ``run_dir`` as soon as the new one can start.
+    mesh: Devices to train on; the default device if None.
 
   Returns:
-    the run folder, steps, updates and the last evaluation.
+    The run folder, steps, updates and the last evaluation.
 
   Raises:
-    ConfigError: before anything is written.
-    RunStopped: SIGINT or SIGTERM came, and the state is saved; or the run cannot go
-      on, and its checkpoints are as they were.
+    UserError: The run cannot start; nothing was written.
+    RunStopped: The run was saved after SIGINT or SIGTERM, or it cannot continue and
+      its checkpoints are unchanged.
   """
-  to_go_on = f"to go on: --resume {run_dir}"
+  hint = f"to continue: --resume {run_dir}"
   with Signals(
-    "stopped before the first iteration was done; "
-    + (to_go_on if resume else "nothing is saved")
+    f"stopped before the first iteration; {hint if resume else 'nothing is saved'}"
   ) as signals:
     start = _start(config, run_dir, mesh, resume=resume, overwrite=overwrite)
     _say(f"run folder {start.folder.path}; compiling, which can take minutes")
     try:
       state, evaluation = _run(config, start, signals)
     except OSError as error:  # The disk is full or gone.
-      raise RunStopped(f"{error}; {to_go_on}", errors.FAILED) from error
+      raise RunStopped(f"{error}; {hint}", errors.FAILED) from error
   if int(state.env_steps) < config.total_steps:
-    # The signal may have come to another process.
+    # Another process may have received the signal.
     number = signals.caught[0] if signals.caught else signal.SIGTERM
     raise RunStopped(
-      f"saved at step {int(state.env_steps):,}; {to_go_on}", errors.INTERRUPTED + number
+      f"saved at step {int(state.env_steps):,}; {hint}", errors.INTERRUPTED + number
     )
   return {
     "run": str(start.folder.path),
@@ -103,7 +102,7 @@ def train(
 def _run(
   config: TrainConfig, start: Start, signals: Signals
 ) -> tuple[TrainState, dict[str, Any]]:
-  """Opens what is written to, and trains; returns the last evaluation too."""
+  """Opens the outputs and trains; returns the state and the last evaluation."""
   path = start.folder.path
   with (
     run_folder.lock(path) if devices.is_primary() else contextlib.nullcontext(),
@@ -124,7 +123,7 @@ def _run(
 def _reporting(
   config: TrainConfig, start: Start
 ) -> Generator[Reporter | Silent, None, None]:
-  """Opens the metrics and the progress; of several processes, the first one tells."""
+  """Yields the reporter, which is silent in all but the first process."""
   devices.run_on_primary(lambda: _set_aside(start))
   if not devices.is_primary():
     yield Silent(start.folder)
@@ -142,7 +141,7 @@ def _reporting(
 def _set_aside(start: Start) -> None:
   path, step = start.folder.path, start.resume_step
   if step is not None and (aside := set_aside(path, step)):
-    _say(f"later checkpoints, and the metrics until then, are now in {aside}")
+    _say(f"later checkpoints and a copy of the metrics were moved to {aside}")
 
 
 def _start(
@@ -153,15 +152,15 @@ def _start(
   resume: bool,
   overwrite: bool,
 ) -> Start:
-  """Builds or restores everything; makes the folder last."""
-  # What Orbax logs of a save that fails, tracebacks of each thread, is said by us.
+  """Builds or restores everything; creates the run folder last."""
+  # Orbax logs a traceback per thread when a save fails; the run reports it in one line.
   logging.getLogger("absl").setLevel(logging.CRITICAL)
   check_sinks(config.sinks)
   count = mesh.size if mesh else 1
   if resume:
     folder = run_folder.open_run(run_dir)
     for change in versions.changed_versions(folder.versions, devices=count):
-      _say(f"not as when the run began: {change}")
+      _say(f"changed since the run began: {change}")
   saved = resume and checkpoint_reader.latest_step(run_dir) is not None
   if saved:
     checkpoint_reader.check(run_dir, None, config=config)
@@ -175,9 +174,9 @@ def _start(
   state = initial_state(config, env, agent, _expert(config, env))
   if state.expert_replay is not None:
     solved, ended = map(int, replay.episodes(state.expert_replay))
-    _say(f"the expert's replay: {solved} of {ended} episodes solved")
+    _say(f"expert replay: {solved} of {ended} episodes solved")
   if resume:
-    _say("it was stopped before its first checkpoint, and begins again")
+    _say("the run has no checkpoint yet and starts from the beginning")
     return Start(env, agent, folder, state, 0)
   devices.run_on_primary(
     lambda: run_folder.create(run_dir, config, overwrite=overwrite, devices=count)
@@ -186,30 +185,31 @@ def _start(
 
 
 def _expert(config: TrainConfig, env: Env) -> ExpertReplay:
-  """How the expert's replay is filled: from a file, or by the scripted expert."""
+  """Returns how to fill the expert replay: from a file or by the scripted expert."""
   if not config.replay.demonstrations:
-    _say("collecting the expert's replay")
+    _say("collecting the expert replay")
     return collect_expert
   path = Path(config.replay.demonstrations)
   demos = demonstrations.load(path, env.task, env.config.control_period_s)
-  _say(f"{demos.instants} instants of {path} for {config.replay.expert_steps} slots")
+  _say(f"{demos.instants} time steps of {path} for {config.replay.expert_steps} slots")
   return lambda config, env, _: expert.replay_from_demonstrations(demos, config, env)
 
 
 def _loop(config, iteration, state, reporter, saver, signals) -> TrainState:
-  """Iterates to the last step; evaluates and saves whenever a multiple is passed."""
+  """Iterates to the last step; evaluates and saves at multiples of the intervals."""
   step, stop = int(state.env_steps), False
   while step < config.total_steps and not stop:
     before = step
     state, metrics = iteration(state)
     step = int(state.env_steps)
-    # Before it is told that an iteration is done, for then there is something to save.
-    signals.finish_first(f"stopped at once; to go on: --resume {reporter.folder.path}")
+    # Before the report: from then on there is something to save.
+    hint = f"to continue: --resume {reporter.folder.path}"
+    signals.finish_first(f"stopped at once; {hint}")
     reporter.iteration(step, int(state.learner.step), metrics | saver.finished())
     faults.check(config, state, reporter.folder)
     done = step >= config.total_steps
     rate = None
-    # Who sends a signal may not wait for an evaluation before the state is safe.
+    # Check for signals first, so that saving does not wait for an evaluation.
     stop = devices.any_process(signals.caught)
     if not stop and (done or _passed(before, step, config.eval_every)):
       rate = reporter.evaluate(step, state, last=done)

@@ -52,12 +52,9 @@ def record_episodes(env: Env, played: Episodes, path: Path) -> Path:
 
 
 def film(env: Env, played: Episodes) -> list[np.ndarray]:
-  """The first episodes; u8[T, H, W, 3] each, from the first to the last instant, which
-  is framed in green if the task was solved and in red if not.
+  """Renders the first episodes, u8[T, H, W, 3] each.
 
-  Args:
-    env: the worlds in which they were played.
-    played: the episodes.
+  The last time step gets a green border if the task was solved, else a red one.
   """
   sizes = (
     ("wide", VIEW_SIZE),

@@ -24,10 +24,10 @@ def main(run: Path) -> None:
   )
   env, agent = apnpql.make_env(config.env), apnpql.make_agent(config.agent)
   state = env.reset(jnp.arange(4))  # One world per row of the bank of reset states.
-  learner = agent.init(jax.random.key(0), state.seen)
+  learner = agent.init(jax.random.key(0), state.observation)
   act, step = jax.jit(agent.act, static_argnums=3), jax.jit(env.step)
   for key in jax.random.split(jax.random.key(1), 10):
-    action, _ = act(learner.params, state.seen, key, False)  # f32[4, 7]; not greedy.
+    action, _ = act(learner.params, state.observation, key, False)  # f32[4, 7]; not greedy.
     state = step(state, action, key)
   print("rewards:", state.timestep.reward)
   print(apnpql.train(config, run, overwrite=True))

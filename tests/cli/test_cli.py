@@ -1,4 +1,4 @@
-"""The command line as a user meets it: real processes, their output and exit codes."""
+"""The command line as users see it: real processes, their output and exit codes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def apnpql(*args: str, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture
 def run_dir(tmp_path: Path) -> Path:
-  """A run folder with nothing but its configuration."""
+  """Creates a run folder that holds only its configuration."""
   folder = tmp_path / "runs" / "old"
   folder.mkdir(parents=True)
   config = files.load_preset("push_plate")
@@ -46,7 +46,7 @@ def run_dir(tmp_path: Path) -> Path:
 
 
 def snapshot(folder: Path) -> dict[str, bytes | None]:
-  """Every path under ``folder`` with its content; None for folders."""
+  """Returns every path under ``folder`` with its content; None for folders."""
   return {
     str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
     for path in sorted(folder.rglob("*"))
@@ -125,16 +125,16 @@ def test_bad_input_ends_with_one_clear_line(line, words, run_dir, tmp_path):
   assert snapshot(tmp_path) == before
 
 
-def test_a_run_from_before_a_setting_is_taken_as_it_was(run_dir, tmp_path):
+def test_a_run_older_than_a_setting_keeps_its_behavior(run_dir, tmp_path):
   data = json.loads((run_dir / "config.json").read_text())
   del data["agent"]["residual_blocks"]
   (run_dir / "config.json").write_text(json.dumps(data))
   for command in ("evaluate runs/old", "train --resume runs/old --seed 9"):
     done = apnpql(*command.split(), cwd=tmp_path)
     assert done.returncode == 2
-    told, refused = done.stderr.splitlines()
-    assert told.endswith("which keep their old behavior: agent.residual_blocks 0")
-    assert "no checkpoint" in refused or "seed 0 -> 9" in refused
+    warning, error = done.stderr.splitlines()
+    assert warning.endswith("which keep their old behavior: agent.residual_blocks 0")
+    assert "no checkpoint" in error or "seed 0 -> 9" in error
 
 
 def test_bad_input_with_json_leaves_standard_output_empty(tmp_path):
@@ -154,7 +154,7 @@ def test_list_prints_one_json_object_and_nothing_else(tmp_path):
   assert names["backends"] == list(BACKENDS)
 
 
-def test_list_for_people_names_the_same(tmp_path):
+def test_list_prints_the_same_names_as_text(tmp_path):
   done = apnpql("list", cwd=tmp_path)
   assert done.returncode == 0
   for word in ("tasks", "push_plate", "ap_npql", *BACKENDS):
@@ -202,7 +202,7 @@ def test_version(tmp_path):
   assert done.stdout.strip() == __import__("apnpql_jax").__version__
 
 
-def test_results_become_plain_json():
+def test_results_are_converted_to_plain_json():
   import jax.numpy as jnp
   import numpy as np
 

@@ -15,7 +15,7 @@ from apnpql_jax.config.codec import flatten
 from apnpql_jax.config.files import config_from_json, config_to_json
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.data import npz
-from apnpql_jax.errors import ConfigError, UserError
+from apnpql_jax.errors import UserError
 from apnpql_jax.runs import run_folder
 
 NUMBERS = st.one_of(
@@ -60,7 +60,7 @@ def test_settings_are_refused_or_read_exactly(changes: dict[str, object]):
       inside[last] = value
   try:
     config = config_from_json(json.dumps(data))
-  except ConfigError as error:
+  except UserError as error:
     assert "\n" not in str(error)
     return
   assert config_from_json(config_to_json(config)) == config
@@ -83,7 +83,7 @@ def test_a_damaged_archive_is_refused_or_right(archive, tmp_path: Path, edits):
   (tmp_path / "a.npz").write_bytes(data)
   try:
     arrays = npz.read(tmp_path / "a.npz", limit=10_000)
-  except ConfigError as error:
+  except UserError as error:
     assert "\n" not in str(error)
     return
   assert sum(array.nbytes for array in arrays.values()) <= 10_000

@@ -1,4 +1,4 @@
-"""Cameras of the environment: whose shadow falls on what."""
+"""Cameras of the environment: which geoms cast and receive shadows."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ HAND = {"hand", "d435", "r1", "l1", "r_tip", "l_tip", "r_pad", "l_pad"}
 
 
 @pytest.mark.parametrize("name", task_names())
-def test_all_of_the_hand_throws_a_shadow(name):
+def test_the_whole_hand_casts_a_shadow(name):
   scene = make_task(name).scene
   found = shadows_of_the_hand(scene, Geoms.from_model(scene.model))
   assert {scene.model.geom(i).name for i in found["shadow_casters"]} == HAND
   assert scene.model.geom("table").id in found["shadow_receivers"]
 
 
-def test_the_shadow_is_seen_on_the_table_and_on_flat_marks_alone(task, resets):
+def test_the_shadow_falls_only_on_the_table_and_flat_marks(task, resets):
   scene = task.scene
   poses = jax.jit(make_kinematics(scene), compiler_options=testing.FAST_COMPILE)(resets)
   plain, shaded = (
@@ -32,7 +32,7 @@ def test_the_shadow_is_seen_on_the_table_and_on_flat_marks_alone(task, resets):
     for shadows in (False, True)
   )
   camera = CameraSpec.from_model(scene.model, "global", height=72, width=96)
-  seen = render(
+  geom = render(
     Geoms.from_model(scene.model),
     camera,
     poses.geom_xpos,
@@ -43,7 +43,7 @@ def test_the_shadow_is_seen_on_the_table_and_on_flat_marks_alone(task, resets):
   ).segmentation
   dark = (plain != shaded).any(-1)
   flat = [scene.model.geom(name).id for name in ("table", "goal")]
-  assert np.isin(seen, flat)[dark].all()
+  assert np.isin(geom, flat)[dark].all()
   assert (dark.sum((1, 2)) > 20).mean() > 0.5
   left = 1.0 - Lighting().shadow
   np.testing.assert_allclose(shaded[dark], left * plain[dark], atol=1.5)

@@ -1,4 +1,4 @@
-"""What `apnpql list --contacts` measures and prints."""
+"""Measurements and output of `apnpql list --contacts`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from apnpql_jax.cli.main import _show_names
+from apnpql_jax.cli.main import _show
 from apnpql_jax.envs.contact_report import contact_report
 from apnpql_jax.tasks import make_task, task_names
 
@@ -28,7 +28,7 @@ SLOTS = {
 
 
 @pytest.mark.parametrize("name", task_names())
-def test_slots_are_those_of_the_pairs_up_to_the_limit_of_the_scene(name):
+def test_slots_are_those_of_the_pairs_up_to_the_scenes_limit(name):
   task = make_task(name)
   model = task.scene.model
   names = [model.numeric(i).name for i in range(model.nnumeric)]
@@ -39,12 +39,12 @@ def test_slots_are_those_of_the_pairs_up_to_the_limit_of_the_scene(name):
     slots[dim] += SLOTS[tuple(sorted((model.geom_type[one], model.geom_type[other])))]
   if "max_contact_points" in names:
     limit = int(model.numeric("max_contact_points").data[0])
-    assert any(slot > limit for slot in slots.values())  # It is of use.
+    assert any(slot > limit for slot in slots.values())  # The limit applies.
     slots = {dim: min(slot, limit) for dim, slot in slots.items()}
   report = contact_report(task, backends=())
   assert report["pairs"] == model.npair
   assert report["contacts"] == sum(slots.values())
-  # Beside contacts: the equalities of the fingers, and a limit per limited joint.
+  # Rows other than contacts: the fingers' equalities, one limit per limited joint.
   others = report["constraint_rows"] - sum(dim * slot for dim, slot in slots.items())
   assert others == model.neq + model.jnt_limited.sum()
 
@@ -53,9 +53,9 @@ def test_speed_is_measured_per_engine_and_printed():
   report = contact_report(make_task("push_plate"), backends=("native",))
   assert report["native_steps_per_s"] > 0
   assert "mjx_steps_per_s" not in report
-  line = _show_names({"push_plate": report})
-  words = (
+  line = _show({"push_plate": report})
+  expected = (
     "push_plate  28 pairs, 12 contacts, 49 constraint rows, ",
     " native steps per s",
   )
-  assert line.startswith(words[0]) and line.endswith(words[1])
+  assert line.startswith(expected[0]) and line.endswith(expected[1])

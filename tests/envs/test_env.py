@@ -38,7 +38,7 @@ def env() -> Env:
 
 @pytest.fixture(scope="module")
 def pixel_chunk(env):
-  """Twelve periods of the expert in four worlds, seen by both cameras."""
+  """Twelve periods of the expert in four worlds, with images of both cameras."""
   pixels = Env(dataclasses.replace(CONFIG, obs="pixels"), env.task, env._bank)
   play = jax.jit(
     lambda start, key: rollout(
@@ -54,7 +54,7 @@ def test_held_out_rows_are_never_trained_on(env):
 
 @pytest.mark.parametrize("noise", [0.1, 0.0])
 def test_density_of_the_expert_is_that_of_its_noise(env, noise: float):
-  """Without noise it is so high that no other policy comes near."""
+  """Without noise it is far higher than that of any other policy."""
   state = env.reset(jnp.arange(16))
   action, log_prob = expert_policy(env, noise=noise)(state, jax.random.key(0))
   mean = env.expert_action(state)[..., :6]
@@ -85,18 +85,19 @@ def test_time_out_truncates_then_resets(env):
   np.testing.assert_array_equal(robot[1, :, 7:14], robot[0, :, 14:])
 
 
-def test_an_lstm_is_shown_by_the_replay_what_it_acted_on(env):
-  """Three instants at a time, of episodes that have four."""
+def test_the_replay_returns_the_observations_that_the_lstm_acted_on(env):
+  """Windows of three instants, in episodes of four."""
   short = Env(SHORT, env.task, env._bank, instants=3)
 
-  def velocity(seen: Observation) -> jax.Array:
-    """f32[b] for one joint: another one for other observations, or another order."""
-    whole = jnp.concatenate([x.reshape(len(x), -1) for x in jax.tree.leaves(seen)], 1)
-    weights = jax.random.normal(jax.random.key(0), whole.shape[1:])
-    return jnp.tanh(whole @ weights / 10.0)
+  def velocity(observation: Observation) -> jax.Array:
+    """Maps observations to f32[b], different for other values or another order."""
+    leaves = [x.reshape(len(x), -1) for x in jax.tree.leaves(observation)]
+    flat = jnp.concatenate(leaves, axis=1)
+    weights = jax.random.normal(jax.random.key(0), flat.shape[1:])
+    return jnp.tanh(flat @ weights / 10.0)
 
-  def act(params, seen: Observation, key, greedy):
-    action = jnp.full((16, 7), 0.5).at[:, 0].set(velocity(seen))
+  def act(params, observation: Observation, key, greedy):
+    action = jnp.full((16, 7), 0.5).at[:, 0].set(velocity(observation))
     return action, {"log_prob": jnp.zeros(16)}
 
   agent = dataclasses.replace(make_agent(AgentConfig()), act=act)
@@ -110,10 +111,10 @@ def test_an_lstm_is_shown_by_the_replay_what_it_acted_on(env):
     return replay.sample(ring, key, batch_size=256, n_step=2, gamma=0.9, instants=3)
 
   batch = play(jax.random.key(0))
-  seen = batch.observation_tm1
-  np.testing.assert_allclose(velocity(seen), batch.action_tm1[:, 0], atol=1e-4)
-  # Drawn at the first instant of an episode, the second, and the third.
-  moves = np.any(seen.robot[:, 1:, -7:] != seen.robot[:, :-1, -7:], axis=-1)
+  observation = batch.observation_tm1
+  np.testing.assert_allclose(velocity(observation), batch.action_tm1[:, 0], atol=1e-4)
+  # Transitions start at the first, the second and a later instant of an episode.
+  moves = np.diff(observation.robot[..., -7:], axis=1).any(axis=-1)
   kinds = np.unique(moves, axis=0)
   np.testing.assert_array_equal(kinds, [[0, 0], [0, 1], [1, 1]])
 
@@ -133,9 +134,7 @@ def test_evaluation_is_repeatable(env, play):
   assert not np.array_equal(first.length, other.length)
 
 
-def test_many_episodes_are_played_in_turns_each_row_once_before_any_is_repeated(
-  env, play, monkeypatch
-):
+def test_every_held_out_row_is_played_before_any_is_repeated(env, play, monkeypatch):
   monkeypatch.setattr(evaluate, "MAX_WORLDS", 16)
   played = play_held_out(env, play, 0.0, episodes=93, seed=5)  # The last turn is short.
   assert len(played.success) == len(played.length) == 93
@@ -147,8 +146,8 @@ def test_many_episodes_are_played_in_turns_each_row_once_before_any_is_repeated(
     np.testing.assert_array_equal(np.sort(found), np.sort(each))
 
 
-def test_an_episode_is_what_steps_from_a_reset_make(env, play):
-  """The player judges and observes at the head of its loop, resets and steps alike."""
+def test_the_player_matches_a_rollout_from_a_reset(env, play):
+  """The player calls ``Env.observe`` at the head of its loop."""
   rows = env.bank_split + jnp.arange(16)
   episodes = play(0.0, rows, jax.random.key(0))
   length = env.config.episode_steps + 1
@@ -172,7 +171,7 @@ def test_an_episode_is_what_steps_from_a_reset_make(env, play):
     np.testing.assert_allclose(joints[instants, i], expected, atol=1e-3)
 
 
-def test_tool_is_where_the_joints_put_it(env):
+def test_the_observed_tool_is_where_the_joints_put_it(env):
   state = env.reset(jnp.arange(16))
   observation = state.timestep.observation
   position, _, _ = arm.forward(
@@ -182,7 +181,7 @@ def test_tool_is_where_the_joints_put_it(env):
 
 
 def test_pixels_show_the_task(env, pixel_chunk):
-  """Plate, goal and gripper are in the images in their colors, at the right size."""
+  """Plate and goal appear in their colors, at the right size, and motion is visible."""
   observation = pixel_chunk.timestep.observation
   assert observation.global_image.shape == (12, 4, 72, 96, 3)
   assert observation.wrist_image.shape == (12, 4, 36, 64, 3)
@@ -194,6 +193,5 @@ def test_pixels_show_the_task(env, pixel_chunk):
   plate = (blue > 2.5 * red).sum((1, 2))
   assert (goal > 80).all() and (goal < 800).all()
   assert (plate > 40).all() and (plate < 400).all()
-  # What moves is seen to move.
   moved = np.abs(image - np.asarray(observation.global_image[-1], int)).max(-1)
   assert ((moved > 20).sum((1, 2)) > 30).all()

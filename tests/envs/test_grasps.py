@@ -1,4 +1,4 @@
-"""What is in the hand keeps its place there; what stands on the table stays."""
+"""Objects do not slip in the hand and do not move on the table."""
 
 from __future__ import annotations
 
@@ -32,12 +32,13 @@ def env(request, backend) -> Env:
 
 
 def pose(state: physics.PhysicsState, address: int) -> tuple[np.ndarray, Rotation]:
+  """Returns positions f64[worlds, 3] and rotations of a free body."""
   qpos = np.asarray(state.qpos[:, address : address + 7], np.float64)
   return qpos[:, :3], Rotation.from_quat(qpos[:, 3:], scalar_first=True)
 
 
 @pytest.mark.parametrize("env", sorted(OBJECTS), indirect=True, scope="module")
-def test_a_carried_object_keeps_its_place_in_the_hand(env):
+def test_a_carried_object_does_not_slip(env):
   """From the first instant in the air until the hand opens: lift, carry, flip."""
   address, _ = env.task.scene.free_joint(OBJECTS[env.task.name])
   site = env.task.scene.tool_site
@@ -68,19 +69,19 @@ def test_a_carried_object_keeps_its_place_in_the_hand(env):
       carried[world] += 1
     solved |= ~over & np.asarray(state.timestep.terminated)
     over |= np.asarray(state.timestep.last)
-  assert (carried > 5).all() and solved.all()  # The whole way, half a turn included.
+  assert (carried > 5).all() and solved.all()  # All the way, including half a turn.
   assert slip.max() < 0.002
   assert np.degrees(turn.max()) < 1.0
 
 
-def test_what_stands_on_the_table_stays(env):
+def test_objects_on_the_table_do_not_move(env):
   """Three seconds with the arm at rest: no drift, no jitter, nothing sinks."""
   state = start = env.reset(jnp.arange(WORLDS)).physics
   step = jax.jit(env.physics.step)
   model = env.task.scene.model
   free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
   if not free.size:
-    pytest.skip("a task of your own, in which nothing stands")
+    pytest.skip("a user's task without free bodies")
   speeds = model.jnt_dofadr[free, None] + np.arange(6)
   for _ in range(20):
     state = step(state, jnp.zeros((WORLDS, 6)), jnp.zeros(WORLDS))

@@ -27,7 +27,7 @@ def task():
 
 @pytest.fixture(scope="module")
 def models(task) -> list[mujoco.MjModel]:
-  """The variants, compiled here, apart from the code under test."""
+  """The variants, compiled independently of the code under test."""
   models = []
   for shape in flip_cup.SHAPES:
     spec = mujoco.MjSpec.from_file(str(mjcf_path("flip_cup")))
@@ -38,7 +38,7 @@ def models(task) -> list[mujoco.MjModel]:
 
 @pytest.fixture(scope="module")
 def state(task) -> physics.PhysicsState:
-  """Cups of all shapes, twice: spinning high in the air, and just above the table."""
+  """Cups of all shapes, first spinning high in the air, then just above the table."""
   state, _ = each_cup(task, WORLDS)
   _, dof = task.scene.free_joint("cup")
   raised = pos(task, state, "cup").at[:, 2].add(np.repeat([0.2, 0.002], 3))
@@ -50,7 +50,7 @@ def state(task) -> physics.PhysicsState:
 def fall(request, task, state):
   """Poses of the cups after 0.15 s with the arm at rest, f32[WORLDS, 7].
 
-  Compiled ahead of time: it refuses what would need another compilation.
+  Compiled ahead of time, so that inputs which need another compilation are an error.
   """
   engine = engines.make_physics(request.param, task.scene, substeps=30)
   address, _ = task.scene.free_joint("cup")
@@ -91,14 +91,14 @@ def test_each_cup_stands_on_its_own_height(moved):
 
 
 def test_worlds_change_their_shapes_without_recompilation(state, fall, moved):
-  """Each world is what its neighbor was, of another shape."""
+  """Each world takes the state and the shape of its neighbor."""
   after = fall(jax.tree.map(lambda x: jnp.roll(x, 1, axis=0), state))
   np.testing.assert_allclose(after, np.roll(moved, 1, axis=0), atol=1e-6)
 
 
 @pytest.fixture(scope="module", params=SLOW_MJX)
 def env(request) -> Env:
-  """With episodes of two periods."""
+  """Environment with episodes of two periods."""
   return make_env(
     EnvConfig(
       task="flip_cup",
@@ -113,16 +113,16 @@ def env(request) -> Env:
 def test_every_reset_draws_a_shape_without_recompilation(env):
   worlds = 16
   state = env.reset(jnp.arange(worlds))
-  still, seen, fresh = jnp.zeros((worlds, 7)), [], []
-  # Compiled ahead of time: it refuses what would need another compilation.
+  still, points, fresh = jnp.zeros((worlds, 7)), [], []
+  # Compiled ahead of time: inputs which need another compilation are an error.
   env_step = jax.jit(env.step).lower(state, still, jax.random.key(0)).compile()
   for t in range(9):
     cup, *_, corner = np.split(np.asarray(env.task.objects(state.physics)), 4, axis=1)
-    seen.append(np.stack([cup[:, 2], *(corner - cup)[:, [0, 2]].T], axis=-1))
+    points.append(np.stack([cup[:, 2], *(corner - cup)[:, [0, 2]].T], axis=-1))
     fresh.append(np.asarray(state.elapsed) == 0)
     state = env_step(state, still, jax.random.key(t))
   # The cup's height over the table, half of its width and half of its height.
-  (height, *size), fresh = np.moveaxis(np.stack(seen), -1, 0), np.stack(fresh)
+  (height, *size), fresh = np.moveaxis(np.stack(points), -1, 0), np.stack(fresh)
   np.testing.assert_allclose(height, size[1], atol=1e-3)
   shape = np.abs(size[1][..., None] - np.array(flip_cup.SHAPES)[:, 2] / 2).argmin(-1)
   shapes = np.array(flip_cup.SHAPES)[shape]
@@ -133,10 +133,10 @@ def test_every_reset_draws_a_shape_without_recompilation(env):
   assert fresh.sum(0).tolist() == [3] * worlds
 
 
-def test_each_world_is_seen_in_its_own_shape(task, models, state):
+def test_each_world_is_rendered_with_its_own_shape(task, models, state):
   kinematics = jax.jit(make_kinematics(task.scene))(state)
   size = (72, 96)
-  seen = segmentation(task.scene, kinematics, size)
+  image = segmentation(task.scene, kinematics, size)
   for world in range(WORLDS):
     model = models[world % len(models)]
     data = mujoco.MjData(model)
@@ -145,9 +145,9 @@ def test_each_world_is_seen_in_its_own_shape(task, models, state):
     mujoco.mj_forward(model, data)
     np.testing.assert_allclose(kinematics.geom_xpos[world], data.geom_xpos, atol=2e-6)
     expected = render_oracles.cast_rays(model, data, "global", *size)[0]
-    # The boxes of a cup share their tops, where either may be seen.
+    # The boxes of a cup overlap at their tops, where either may be hit.
     walls = [model.geom(f"cup_{i}").id for i in range(4)]
-    same = seen[world] == expected
-    same |= np.isin(seen[world], walls) & np.isin(expected, walls)
+    same = image[world] == expected
+    same |= np.isin(image[world], walls) & np.isin(expected, walls)
     assert np.isin(expected, walls).sum() > 60
     assert (~same).sum() <= 3  # Rays along an edge, in single precision.

@@ -1,4 +1,4 @@
-"""Worlds of their own: what is drawn, what follows, and what stays when it is off."""
+"""Domain randomization: draws, derived constants, and no effect when it is off."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_a_setting_does_not_change_what_the_others_draw(task, drawn):
   assert "waves" not in fewer.fields and "body_mass" not in fewer.fields
 
 
-def test_what_is_drawn_fills_its_range_and_differs_between_worlds(task, drawn):
+def test_draws_fill_their_range_and_differ_between_worlds(task, drawn):
   model, fields = task.scene.model, {k: np.asarray(v) for k, v in drawn.fields.items()}
   body, table = model.body("plate").id, model.geom("table").id
   plate = model.geom("plate_floor").id
@@ -155,13 +155,13 @@ def test_geoms_of_the_robot_change_their_color_together(task, drawn):
 
 @pytest.fixture(scope="module", params=task_names())
 def any_task(request):
-  """A task, and worlds of it."""
+  """A task and randomized worlds of it."""
   task = make_task(request.param)
   return task, _randomized(task, seed=1)
 
 
 def _model(task, state: physics.PhysicsState, world: int) -> mujoco.MjModel:
-  """That of one world, without what MuJoCo derives."""
+  """Returns the model of one world, without the constants that MuJoCo derives."""
   model = copy.copy(task.scene.model)
   given = (
     "body_mass body_inertia body_ipos body_pos body_quat geom_size geom_pos "
@@ -173,7 +173,7 @@ def _model(task, state: physics.PhysicsState, world: int) -> mujoco.MjModel:
 
 
 def _data(model: mujoco.MjModel, state: physics.PhysicsState, world: int):
-  """Poses of one world, by C MuJoCo."""
+  """Computes the poses of one world in C MuJoCo."""
   data = mujoco.MjData(model)
   for name in ("qpos", "mocap_pos", "mocap_quat"):
     getattr(data, name)[:] = np.asarray(getattr(state, name)[world])
@@ -208,20 +208,20 @@ def test_objects_of_any_size_and_shape_stand_on_the_table(any_task):
       assert np.ptp(sizes[:, geoms], axis=0).max() > 0.0003
 
 
-def test_what_is_seen_stands_where_c_mujoco_has_it(task, drawn):
+def test_poses_agree_with_c_mujoco(task, drawn):
   """Cameras, robot and objects of randomized worlds."""
-  seen = _kinematics(task)(drawn)
+  kinematics = _kinematics(task)(drawn)
   for world in range(WORLDS):
     data = _data(_model(task, drawn, world), drawn, world)
     for name in ("geom_xpos", "cam_xpos", "site_xpos", "geom_xmat", "cam_xmat"):
       expected = getattr(data, name)
-      found = np.asarray(getattr(seen, name)[world]).reshape(expected.shape)
+      found = np.asarray(getattr(kinematics, name)[world]).reshape(expected.shape)
       np.testing.assert_allclose(found, expected, atol=1e-5, err_msg=name)
-  camera = np.asarray(seen.cam_xpos)[:, task.scene.id("camera", "global")]
+  camera = np.asarray(kinematics.cam_xpos)[:, task.scene.id("camera", "global")]
   assert np.ptp(camera, axis=0).min() > 0.5 * ALL.camera_shift
 
 
-def test_the_arm_stands_where_the_world_has_it(task, drawn):
+def test_forward_kinematics_include_the_pose_of_the_base(task, drawn):
   kinematics = _kinematics(task)(drawn)
   chain = arm.make_chain(task.scene)
   joints = drawn.qpos[:, None, task.scene.arm_qpos]
@@ -234,8 +234,8 @@ def test_the_arm_stands_where_the_world_has_it(task, drawn):
   assert np.linalg.norm(own - position, axis=-1).max() > 0.01
 
 
-def test_a_late_command_is_two_commands_one_after_the_other(task, drawn):
-  """Bit for bit what an engine does that is told so."""
+def test_a_delayed_command_equals_two_commands_in_sequence(task, drawn):
+  """An engine steps through the former command, then through the new one."""
   former, command = (
     jnp.asarray(np.random.default_rng(i).uniform(-1, 1, (WORLDS, 7)), jnp.float32)
     for i in range(2)
@@ -248,17 +248,17 @@ def test_a_late_command_is_two_commands_one_after_the_other(task, drawn):
   for world in range(WORLDS):
     steps = int(drawn.fields["control_delay"][world])
     one = jax.tree.map(lambda x: x[world : world + 1], drawn).replace(command=None)  # noqa: B023
-    for count, told in ((steps, former), (10 - steps, command)):
+    for count, action in ((steps, former), (10 - steps, command)):
       if count:
         part = engines.make_physics("native", task.scene, substeps=count)
-        one = part.step(one, told[world, None, :6], told[world, None, 6])
+        one = part.step(one, action[world, None, :6], action[world, None, 6])
     np.testing.assert_allclose(one.qpos[0], after.qpos[world], atol=1e-6)
 
 
 def test_both_engines_move_the_same_worlds(task, drawn):
   velocity = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (WORLDS, 6)), "f4")
   close, moved = jnp.zeros(WORLDS), {}
-  # Off their limits, which the engines take differently.
+  # Away from their limits, which the engines treat differently.
   fingers = slice(task.scene.gripper_qpos, task.scene.gripper_qpos + 4)
   drawn = drawn.replace(qpos=drawn.qpos.at[:, fingers].set(0.6))
   for name in ("native", "mjx"):
@@ -278,7 +278,7 @@ def plain_env() -> Env:
 
 
 def _episodes(env: Env):
-  """Two episodes of three periods and the first instants of a third."""
+  """Plays two episodes of three periods and the first instant of a third."""
   play = jax.jit(
     lambda rows, key: rollout(
       env, expert_policy(env, noise=0.1), env.reset(rows), key, length=9
@@ -288,7 +288,7 @@ def _episodes(env: Env):
   return play(jnp.arange(4), jax.random.key(0))
 
 
-def test_with_all_ranges_zero_it_is_as_if_it_were_not_there(plain_env):
+def test_zero_ranges_equal_no_randomization(plain_env):
   plain = dataclasses.replace(
     CONFIG, obs="pixels", global_size=(12, 16), wrist_size=(8, 12)
   )
@@ -300,8 +300,8 @@ def test_with_all_ranges_zero_it_is_as_if_it_were_not_there(plain_env):
   assert _bits(off) == _bits(zero)
 
 
-def test_a_state_keeps_its_types(plain_env):
-  """So that one compilation serves every iteration, and a loop can play episodes."""
+def test_a_step_keeps_the_types_of_the_state(plain_env):
+  """One compilation then serves every iteration, and a loop can play episodes."""
   config = dataclasses.replace(CONFIG, obs="pixels", shadows=True, randomize=True)
   env = Env(config, plain_env.task, plain_env._bank, instants=3)
   play = make_player(env, lambda noise: expert_policy(env, noise=noise))
@@ -314,7 +314,7 @@ def test_a_state_keeps_its_types(plain_env):
   assert not any(x.weak_type for x in jax.tree.leaves(start))
 
 
-def test_each_episode_has_a_world_of_its_own(plain_env):
+def test_each_episode_has_its_own_world(plain_env):
   env = Env(
     dataclasses.replace(CONFIG, randomize=True), plain_env.task, plain_env._bank
   )
@@ -341,7 +341,7 @@ def test_each_episode_has_a_world_of_its_own(plain_env):
   assert _bits(jax.tree.map(lambda x: x[4], again)) != _bits(
     jax.tree.map(lambda x: x[4], fields)
   )
-  # The robot reports where the tool is as if the table stood as in the scene file.
+  # The reported tool position assumes the table of the scene file.
   joints = timestep.observation.robot[..., -7:-1]
   position, _, _ = arm.forward(arm.make_chain(env.task.scene), joints)
   np.testing.assert_allclose(timestep.observation.tool, position, atol=1e-5)

@@ -1,4 +1,4 @@
-"""Looks that differ between worlds, against models that have them and against NumPy."""
+"""Appearance per world, against models with the same values and against NumPy."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ HEIGHT, WIDTH = 48, 64
 
 
 def _model(*, turn: float = 0.0) -> mujoco.MjModel:
-  """A scene whose colors, sizes, light and camera follow from one number."""
+  """Returns a model whose colors, sizes, light and camera depend on one number."""
   xml = f"""
 <mujoco><worldbody>
   <light directional="true" dir="{0.4 - turn} -0.2 -1"/>
@@ -31,7 +31,7 @@ def _model(*, turn: float = 0.0) -> mujoco.MjModel:
   return mujoco.MjModel.from_xml_string(xml)
 
 
-def _look(model: mujoco.MjModel, fields=None, background=(0.5, 0.6, 0.7)) -> Image:
+def _poses(model: mujoco.MjModel) -> list[np.ndarray]:
   data = mujoco.MjData(model)
   mujoco.mj_forward(model, data)
   poses = (
@@ -40,10 +40,14 @@ def _look(model: mujoco.MjModel, fields=None, background=(0.5, 0.6, 0.7)) -> Ima
     data.cam_xpos[0],
     data.cam_xmat[0].reshape(3, 3),
   )
+  return [np.asarray(pose, np.float32) for pose in poses]
+
+
+def _image(model: mujoco.MjModel, fields=None, background=(0.5, 0.6, 0.7)) -> Image:
   return render(
     Geoms.from_model(model),
     CameraSpec.from_model(model, "eye", height=HEIGHT, width=WIDTH),
-    *(np.asarray(pose, np.float32) for pose in poses),
+    *_poses(model),
     Lighting.from_model(model, background=background),
     fields=fields,
   )
@@ -57,7 +61,7 @@ def _fields(model: mujoco.MjModel, background) -> dict[str, jax.Array]:
     "light_ambient": plain.ambient * ones,
     "light_diffuse": plain.diffuse * ones,
     "background": np.array(background, np.float32),
-    "body_mass": model.body_mass,  # Does not count.
+    "body_mass": model.body_mass,  # Ignored.
   }
   return {name: jnp.asarray(value, jnp.float32) for name, value in fields.items()}
 
@@ -73,39 +77,36 @@ def _assert_same(image: Image, expected: Image) -> None:
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.1])
-def test_fields_are_as_if_the_model_had_them(turn):
+def test_fields_equal_a_model_with_these_values(turn):
+  """The fields of one model, applied to another, give the image of the first."""
   other, background = _model(turn=turn), (0.3, 0.8 - turn, 0.4)
-  image = _look(_model(), _fields(other, background))
-  _assert_same(image, _look(other, background=background))
+  image = _image(_model(), _fields(other, background))
+  _assert_same(image, _image(other, background=background))
 
 
-def test_worlds_have_looks_of_their_own():
+def test_each_world_has_its_own_appearance():
+  """A batch of three worlds equals three single images."""
   models = [_model(turn=turn) for turn in (0.0, 0.05, 0.1)]
   fields = [_fields(model, (0.1, 0.2, 0.3)) for model in models]
-  data = mujoco.MjData(models[0])
-  mujoco.mj_forward(models[0], data)
-  poses = (
-    data.geom_xpos,
-    data.geom_xmat.reshape(-1, 3, 3),
-    data.cam_xpos[0],
-    data.cam_xmat[0].reshape(3, 3),
-  )
   together = render(
     Geoms.from_model(models[0]),
     CameraSpec.from_model(models[0], "eye", height=HEIGHT, width=WIDTH),
-    *(jnp.tile(jnp.asarray(p, jnp.float32), (3, *[1] * p.ndim)) for p in poses),
+    *(np.tile(pose, (3, *[1] * pose.ndim)) for pose in _poses(models[0])),
     Lighting.from_model(models[0]),
     fields=jax.tree.map(lambda *x: jnp.stack(x), *fields),
   )
   for world in range(3):
-    alone = _look(models[0], fields[world])
+    alone = _image(models[0], fields[world])
     _assert_same(jax.tree.map(lambda x: x[world], together), alone)  # noqa: B023
   assert (together.rgb[0] != together.rgb[2]).any()
 
 
 def _local_points(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-  """Geom ids [H, W], points in the geoms' own frames [H, W, 3], by MuJoCo's rays; where
-  nothing is hit the direction of the ray, a unit vector of the world."""
+  """Returns geom ids [H, W] and points [H, W, 3] in the frames of the geoms hit.
+
+  Both come from MuJoCo's rays. A ray without a hit gets its direction as a point: a
+  unit vector in the world frame.
+  """
   data = mujoco.MjData(model)
   mujoco.mj_forward(model, data)
   rays = render_oracles.ray_directions(HEIGHT, WIDTH, model.cam_fovy[0])
@@ -118,8 +119,8 @@ def _local_points(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
   return ids, np.einsum("hwji,hwj->hwi", mats, points)
 
 
-def test_textures_follow_from_where_a_ray_hits():
-  """Two geoms with checkers, two and the background with noise, by NumPy."""
+def test_textures_match_numpy_at_the_hit_points():
+  """Two geoms have checkers; two others and the background have noise."""
   model, rng = _model(), np.random.default_rng(0)
   waves = np.zeros((5, 3, 4))
   waves[..., 3] = rng.random((5, 3))
@@ -132,7 +133,7 @@ def test_textures_follow_from_where_a_ray_hits():
   grain = np.array([0.0, 0.0, 0.5, 0.8, 0.6])
   fields = {"waves": waves, "odd_rgb": odd, "grain": grain}
   fields = {name: jnp.asarray(value, jnp.float32) for name, value in fields.items()}
-  plain, image = _look(model), _look(model, fields)
+  plain, image = _image(model), _image(model, fields)
   np.testing.assert_array_equal(plain.segmentation, image.segmentation)
   np.testing.assert_array_equal(plain.depth, image.depth)
 
@@ -148,7 +149,8 @@ def test_textures_follow_from_where_a_ray_hits():
   dim = 1 - grain[ids] * noise
   expected = 256 * color * factor.mean(-1, keepdims=True) * dim[..., None]
   error = np.abs(np.asarray(image.rgb) - expected).max(-1)[same]
-  assert (error < 6).mean() > 0.99  # A pixel on the edge of a square may be either.
+  # Pixels on the edge of a square may have either color.
+  assert (error < 6).mean() > 0.99
   for geom in range(-1, 4):
     assert (ids == geom).sum() > 30
   assert 0.2 < is_odd[ids == 0].mean() < 0.8 and np.ptp(noise[ids == 3]) > 0.3

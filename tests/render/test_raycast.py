@@ -1,4 +1,4 @@
-"""The ray caster against MuJoCo's rays, MuJoCo's rasteriser and numpy."""
+"""The ray caster against MuJoCo's rays, MuJoCo's rasterizer and NumPy."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _scene() -> str:
 
 
 def _look_at(position: np.ndarray, target: np.ndarray, roll: float) -> np.ndarray:
-  """Quaternion of a camera at ``position`` that looks at ``target``."""
+  """Returns the quaternion of a camera at ``position`` that looks at ``target``."""
   back = (position - target) / np.linalg.norm(position - target)
   right = np.cross([0.3, 0.2, 0.93], back)
   right /= np.linalg.norm(right)
@@ -70,7 +70,7 @@ def _look_at(position: np.ndarray, target: np.ndarray, roll: float) -> np.ndarra
 
 
 def _randomize(model: mujoco.MjModel, data: mujoco.MjData, rng) -> None:
-  """Geoms in a box around (0, 0, 0.45), the camera 1.1 to 1.6 m from there."""
+  """Draws geoms in a box around (0, 0, 0.45), and the camera 1.1 to 1.6 m away."""
   for k in range(model.nmocap):
     data.mocap_pos[k] = rng.uniform([-0.5, -0.5, 0.2], [0.5, 0.5, 0.7])
     data.mocap_quat[k] = rng.normal(size=4)
@@ -87,7 +87,7 @@ def _randomize(model: mujoco.MjModel, data: mujoco.MjData, rng) -> None:
 
 
 def _poses(data: mujoco.MjData, camera: CameraSpec) -> tuple[np.ndarray, ...]:
-  """Copies of the arrays that ``render`` takes, in float32."""
+  """Returns copies of the poses that ``render`` takes, in float32."""
   arrays = (
     data.geom_xpos,
     data.geom_xmat.reshape(-1, 3, 3),
@@ -99,7 +99,7 @@ def _poses(data: mujoco.MjData, camera: CameraSpec) -> tuple[np.ndarray, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class World:
-  """A model, what is drawn of it, and n random states with their poses."""
+  """A model, its visible geoms, and n random states with their poses."""
 
   model: mujoco.MjModel
   geoms: Geoms
@@ -108,6 +108,7 @@ class World:
   poses: tuple[np.ndarray, ...]  # [n, ...]
 
   def data(self, k: int) -> mujoco.MjData:
+    """Returns MuJoCo's data in state ``k``."""
     data = mujoco.MjData(self.model)
     mujoco.mj_setState(self.model, data, self.states[k], render_oracles.STATE)
     mujoco.mj_forward(self.model, data)
@@ -116,6 +117,7 @@ class World:
 
 @pytest.fixture(scope="module")
 def world() -> World:
+  """Returns a world with every geom type in random poses."""
   model = mujoco.MjModel.from_xml_string(_scene())
   data = mujoco.MjData(model)
   camera = CameraSpec.from_model(model, "eye", height=HEIGHT, width=WIDTH)
@@ -129,7 +131,7 @@ def world() -> World:
 
 
 def _interior(ids: np.ndarray) -> np.ndarray:
-  """bool[n, H, W]: pixels whose eight neighbors show the same geom."""
+  """Returns bool[n, H, W]: all eight neighbors of the pixel show the same geom."""
   padded = np.pad(ids, ((0, 0), (1, 1), (1, 1)), "edge")
   height, width = ids.shape[1:]
   same = np.ones(ids.shape, bool)
@@ -139,13 +141,13 @@ def _interior(ids: np.ndarray) -> np.ndarray:
   return same
 
 
-def _hold_together(image, ids: np.ndarray, depth: np.ndarray, tolerance: float):
-  """Requires that all but edge pixels agree."""
+def _assert_agree(image, ids: np.ndarray, depth: np.ndarray, tolerance: float):
+  """Asserts that all pixels agree except those at edges."""
   interior = _interior(ids)
   agree = (np.asarray(image.segmentation) == ids)[interior]
   assert agree.mean() >= 0.999
-  seen = interior & (np.asarray(image.segmentation) == ids) & (ids >= 0)
-  error = np.abs(np.asarray(image.depth)[seen] / depth[seen] - 1.0)
+  hit = interior & (np.asarray(image.segmentation) == ids) & (ids >= 0)
+  error = np.abs(np.asarray(image.depth)[hit] / depth[hit] - 1.0)
   assert np.quantile(error, 0.999) < tolerance
   nothing = np.asarray(image.segmentation) == -1
   np.testing.assert_array_equal(np.isinf(np.asarray(image.depth)), nothing)
@@ -153,12 +155,13 @@ def _hold_together(image, ids: np.ndarray, depth: np.ndarray, tolerance: float):
 
 @pytest.mark.parametrize("oracle", ORACLES)
 def test_segmentation_and_depth_of_random_states(world, oracle):
+  """Every geom type is visible and agrees with the oracle."""
   image = render(world.geoms, world.camera, *world.poses)
   ids, depth = render_oracles.look(
     oracle, world.model, world.states, "eye", HEIGHT, WIDTH
   )
   assert set(np.unique(ids)) == {-1, *world.geoms.ids.tolist()}
-  _hold_together(image, ids, depth, 1e-3 if oracle == "rasteriser" else 1e-4)
+  _assert_agree(image, ids, depth, 1e-3 if oracle == "rasteriser" else 1e-4)
 
 
 @pytest.mark.parametrize("oracle", ORACLES)
@@ -166,6 +169,7 @@ def test_segmentation_and_depth_of_random_states(world, oracle):
   ("name", "height", "width"), [("global", 72, 96), ("wrist", 36, 64)]
 )
 def test_segmentation_and_depth_of_push_plate(oracle, name, height, width):
+  """Both cameras of a shipped scene agree with the oracle."""
   model = mujoco.MjModel.from_xml_path(str(MJCF / "push_plate.xml"))
   data, rng = mujoco.MjData(model), np.random.default_rng(0)
   camera = CameraSpec.from_model(model, name, height=height, width=width)
@@ -183,11 +187,11 @@ def test_segmentation_and_depth_of_push_plate(oracle, name, height, width):
   batch = [np.stack(p) for p in zip(*poses, strict=True)]
   image = render(Geoms.from_model(model), camera, *batch)
   ids, depth = render_oracles.look(oracle, model, np.stack(states), name, height, width)
-  _hold_together(image, ids, depth, 1e-3)
+  _assert_agree(image, ids, depth, 1e-3)
 
 
 def _single(xml: str, height: int = HEIGHT, width: int = WIDTH):
-  """Model, data and camera "eye" of a scene at rest."""
+  """Returns model, data and camera "eye" of a scene at rest."""
   model = mujoco.MjModel.from_xml_string(f"<mujoco>{xml}</mujoco>")
   data = mujoco.MjData(model)
   mujoco.mj_forward(model, data)
@@ -195,7 +199,7 @@ def _single(xml: str, height: int = HEIGHT, width: int = WIDTH):
 
 
 def test_rays_along_the_axis_of_round_geoms():
-  """The transverse part of the direction vanishes in the middle pixel."""
+  """In the middle pixel the transverse part of the direction vanishes."""
   model, data, camera = _single(
     """<worldbody>
       <geom type="plane" size="0 0 0.1"/>
@@ -206,19 +210,18 @@ def test_rays_along_the_axis_of_round_geoms():
     height=41,
     width=41,
   )
-  ids, depth, _ = render_oracles.cast_rays(model, data, "eye", 41, 41)
-  poses = _poses(data, camera)
   for x in (0.0, 0.3, -0.3):
     data.cam_xpos[0, 0] = x
     ids, depth, _ = render_oracles.cast_rays(model, data, "eye", 41, 41)
     poses = _poses(data, camera)
     image = render(Geoms.from_model(model), camera, *poses)
-    _hold_together(jax.tree.map(lambda a: a[None], image), ids[None], depth[None], 1e-4)
+    _assert_agree(jax.tree.map(lambda a: a[None], image), ids[None], depth[None], 1e-4)
     assert image.segmentation[20, 20] == ids[20, 20] > 0
     np.testing.assert_allclose(image.depth[20, 20], depth[20, 20], rtol=1e-5)
 
 
 def test_unbounded_plane_ends_at_the_horizon():
+  """Rays above the horizon hit nothing."""
   model, data, camera = _single(
     """<worldbody><geom type="plane" size="0 0 0.1"/>
     <camera name="eye" pos="0 0 0.5" xyaxes="0 -1 0 0.1 0 1" fovy="60"/></worldbody>"""
@@ -231,7 +234,8 @@ def test_unbounded_plane_ends_at_the_horizon():
   np.testing.assert_allclose(np.asarray(image.depth)[near], depth[near], rtol=1e-4)
 
 
-def test_a_plane_is_not_seen_from_behind():
+def test_a_plane_is_invisible_from_behind():
+  """A camera under the plane sees the sphere above it."""
   model, data, camera = _single(
     """<worldbody><geom type="plane" size="0 0 0.1"/>
     <geom type="sphere" size="0.1" pos="0 0 0.5"/>
@@ -245,7 +249,7 @@ def test_a_plane_is_not_seen_from_behind():
 
 @pytest.mark.parametrize("name", sorted(_GEOMS))
 def test_a_camera_inside_a_geom_sees_through_it(world, name):
-  """As with the geom moved behind the camera."""
+  """The image equals that with the geom moved behind the camera."""
   poses = [p[0].copy() for p in world.poses]
   geom = world.model.geom(name).id
   poses[0][geom], poses[1][geom] = poses[2], poses[3] @ poses[1][geom]
@@ -256,7 +260,8 @@ def test_a_camera_inside_a_geom_sees_through_it(world, name):
   jax.tree.map(np.testing.assert_array_equal, inside, behind)
 
 
-def test_what_is_nearer_than_the_limit_is_not_drawn(world):
+def test_geoms_nearer_than_the_limit_are_not_drawn(world):
+  """Geoms beyond the limit stay as they are."""
   poses = [p[0] for p in world.poses]
   everything = render(world.geoms, world.camera, *poses)
   limit = float(np.median(everything.depth))
@@ -269,7 +274,7 @@ def test_what_is_nearer_than_the_limit_is_not_drawn(world):
 
 
 def test_shading_follows_the_documented_formula(world):
-  """Normals from MuJoCo's rays, the formula in numpy."""
+  """The formula in NumPy, with the normals of MuJoCo's rays, gives the same colors."""
   light = Lighting(
     direction=(0.4, -0.2, -1.0),
     ambient=0.2,
@@ -289,11 +294,12 @@ def test_shading_follows_the_documented_formula(world):
     expected[ids < 0] = light.background
     close = np.abs(np.asarray(image.rgb[k]) / 255.0 - expected).max(axis=-1) < 0.02
     same = np.asarray(image.segmentation[k]) == ids
-    # Two faces of a box or cylinder meet inside a geom.
+    # Not all: faces of a box or cylinder meet in the interior of a segment.
     assert close[same].mean() > 0.99
 
 
 def test_intensity_one_is_full_white():
+  """Full intensity gives 255 and neither overflows nor changes the color."""
   model, data, camera = _single(
     """<worldbody><geom type="plane" size="0 0 0.1" rgba="1 0.5 0 1"/>
     <camera name="eye" pos="0 0 1"/></worldbody>"""
@@ -306,7 +312,7 @@ def test_intensity_one_is_full_white():
 
 
 def _shadow_rays(world: World, data, casters: list[int], toward) -> np.ndarray:
-  """bool[H, W]: rays from what is seen towards the light meet one of the casters."""
+  """Returns bool[H, W]: the ray from the visible point to the light meets a caster."""
   model, camera = world.model, world.camera.id
   rays = render_oracles.ray_directions(HEIGHT, WIDTH, model.cam_fovy[camera])
   _, depth, _ = render_oracles.cast_rays(model, data, "eye", HEIGHT, WIDTH)
@@ -326,6 +332,7 @@ def _shadow_rays(world: World, data, casters: list[int], toward) -> np.ndarray:
 
 
 def test_shadows_fall_where_rays_to_the_light_are_blocked(world):
+  """Shadows dim the floor, and only where MuJoCo's rays meet a caster."""
   casters = tuple(world.model.geom(n).id for n in ("sphere", "rod", "capsule", "slab"))
   floor = world.model.geom("floor").id
   plain = Lighting(direction=(0.4, -0.2, -1.0))
@@ -347,12 +354,13 @@ def test_shadows_fall_where_rays_to_the_light_are_blocked(world):
   )
   expected &= on_floor
   assert expected.mean() > 0.01
-  # Rays decide both pictures, so edges count too.
+  # Rays decide both images, so edges count too.
   assert (changed != expected)[on_floor].sum() <= 2
 
 
 @pytest.mark.parametrize("repeat", [2, 5])
 def test_checker_follows_the_texture(repeat):
+  """Squares have the edge and colors of the MJCF texture."""
   model, data, camera = _single(
     f"""<asset><texture name="t" type="2d" builtin="checker" rgb1="0.2 0.4 0.6"
       rgb2="0.8 0.6 0.4" width="32" height="32"/>
@@ -376,6 +384,8 @@ def test_checker_follows_the_texture(repeat):
 
 
 def test_same_pixels_alone_batched_and_inside_transformations(world):
+  """Batches, vmap, scan and single images differ by rounding at most."""
+
   def view(*poses):
     return render(world.geoms, world.camera, *poses)
 
@@ -397,7 +407,7 @@ def test_same_pixels_alone_batched_and_inside_transformations(world):
     np.testing.assert_array_equal(other.segmentation, batched.segmentation)
     depths = np.asarray(other.depth), np.asarray(batched.depth)
     np.testing.assert_allclose(*(x[~grazed] for x in depths), rtol=1e-5)
-    # Rays that graze a capsule magnify rounding: 3e-5 on 10 pixels of 60,000.
+    # Rays that graze a capsule amplify rounding: 3e-5 on 10 pixels of 60,000.
     np.testing.assert_allclose(*(x[grazed] for x in depths), rtol=5e-5)
     difference = np.abs(
       np.asarray(other.rgb, np.int32) - np.asarray(batched.rgb, np.int32)
@@ -407,6 +417,7 @@ def test_same_pixels_alone_batched_and_inside_transformations(world):
 
 
 def test_shapes_dtypes_and_omitted_outputs(world):
+  """Leading axes are kept, and outputs not requested are None."""
   poses = [p[:6].reshape(2, 3, *p.shape[1:]) for p in world.poses]
   image = render(world.geoms, world.camera, *poses, outputs=("rgb",))
   assert image.rgb.shape == (2, 3, HEIGHT, WIDTH, 3) and image.rgb.dtype == jnp.uint8
@@ -418,7 +429,8 @@ def test_shapes_dtypes_and_omitted_outputs(world):
   assert image.segmentation.dtype == jnp.int32
 
 
-def test_an_image_whose_pixels_do_not_fill_the_blocks(world):
+def test_pixels_need_not_fill_the_blocks(world):
+  """63 pixels are not a multiple of the number of blocks."""
   odd = dataclasses.replace(world.camera, height=7, width=9)
   image = render(world.geoms, odd, *world.poses)
   ids, depth = render_oracles.look("rays", world.model, world.states, "eye", 7, 9)
@@ -428,6 +440,7 @@ def test_an_image_whose_pixels_do_not_fill_the_blocks(world):
 
 
 def test_no_silent_promotion(world):
+  """Shadows and shading pass JAX's strict promotion."""
   with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
     light = Lighting(
       shadow_casters=(world.model.geom("box").id,),
@@ -437,11 +450,12 @@ def test_no_silent_promotion(world):
   assert np.isfinite(np.asarray(image.rgb)).all()
 
 
-def test_bad_arguments_are_refused(world):
+def test_invalid_arguments_are_rejected(world):
+  """The errors name the argument and the valid choices."""
   poses = world.poses
   with pytest.raises(ValueError, match="outputs must be some of"):
     render(world.geoms, world.camera, *poses, outputs=("color",))
-  with pytest.raises(ValueError, match="poses do not fit"):
+  with pytest.raises(ValueError, match="poses do not match"):
     render(world.geoms, world.camera, poses[0][:3], *poses[1:])
   floor, disc = world.model.geom("floor").id, world.model.geom("disc").id
   light = Lighting(shadow_casters=(disc,), shadow_receivers=(floor,))
@@ -479,13 +493,15 @@ def test_bad_arguments_are_refused(world):
     ),
   ],
 )
-def test_geoms_that_cannot_be_drawn_are_refused(xml, message):
+def test_unsupported_geoms_are_rejected(xml, message):
+  """The errors name the geom and the reason."""
   model = mujoco.MjModel.from_xml_string(f"<mujoco>{xml}</mujoco>")
   with pytest.raises(ValueError, match=message):
     Geoms.from_model(model)
 
 
 def test_hidden_geoms_and_materials():
+  """Alpha and group hide geoms; a material replaces only the default color."""
   model = mujoco.MjModel.from_xml_string(
     """<mujoco><asset><material name="m" rgba="0.1 0.2 0.3 1"/></asset><worldbody>
     <geom type="sphere" size="1" rgba="1 0 0 0"/>
@@ -501,6 +517,7 @@ def test_hidden_geoms_and_materials():
 
 
 def test_light_of_the_model(world):
+  """The direction comes from the MJCF, which must have one directional light."""
   light = Lighting.from_model(world.model, ambient=0.1)
   direction = np.array([0.4, -0.2, -1.0])
   np.testing.assert_allclose(light.direction, direction / np.linalg.norm(direction))

@@ -326,7 +326,7 @@ def test_a_record_that_somebody_wrote_is_refused_in_one_line_or_right(foreign, d
   path.write_text(json.dumps(record))
   try:
     found = checkpoint_reader.restore(foreign, None, {"state": _state()}, config=CONFIG)
-  except ConfigError as error:
+  except UserError as error:
     assert len(str(error)) < 2000
   else:
     _assert_same_bits(found.items["state"], _state(1))

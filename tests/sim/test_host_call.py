@@ -1,4 +1,4 @@
-"""NumPy called from compiled code: what comes in and goes out, errors, and caching."""
+"""NumPy called from compiled code: arguments, results, errors and caching."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ def _shape(*shape: int) -> jax.ShapeDtypeStruct:
 
 
 @pytest.mark.parametrize("device", ["cpu", "gpu"])
-def test_arrays_of_every_rank_go_through_a_scan(device, monkeypatch):
-  """Other devices than the CPU take another way, which works on a CPU too."""
+def test_arrays_of_every_rank_pass_through_a_scan(device, monkeypatch):
+  """Other devices than the CPU use a callback, which works on a CPU too."""
   monkeypatch.setattr(jax, "default_backend", lambda: device)
-  seen = []
+  shapes = []
 
   def function(a, b, empty):
-    seen.append((a.shape, b.shape, empty.shape))
+    shapes.append((a.shape, b.shape, empty.shape))
     return [a + b, np.float32(a.sum()), empty]
 
   name = f"test_every_rank_{device}"
@@ -30,8 +30,8 @@ def test_arrays_of_every_rank_go_through_a_scan(device, monkeypatch):
   @jax.jit
   def run(a, b):
     def body(a, _):
-      shapes = (_shape(2, 3), _shape(), _shape(2, 0, 3))
-      moved, total, empty = host_call.call(name, shapes, a, b, jnp.zeros((2, 0, 3)))
+      results = (_shape(2, 3), _shape(), _shape(2, 0, 3))
+      moved, total, empty = host_call.call(name, results, a, b, jnp.zeros((2, 0, 3)))
       return moved, (total, empty)
 
     return jax.lax.scan(body, a, None, length=3)
@@ -41,14 +41,16 @@ def test_arrays_of_every_rank_go_through_a_scan(device, monkeypatch):
   np.testing.assert_array_equal(moved, a + 3)
   np.testing.assert_array_equal(totals, [15, 21, 27])
   assert empty.shape == (3, 2, 0, 3)
-  assert seen == 3 * [((2, 3), (2, 3), (2, 0, 3))]
+  assert shapes == 3 * [((2, 3), (2, 3), (2, 0, 3))]
 
 
 def test_errors_of_the_function_reach_the_caller():
+  """The function raises, returns a wrong shape, and gets an integer."""
+
   def function(x):
     if x < 0:
       raise ArithmeticError("below zero")
-    return [np.zeros(3, np.float32)]  # Of another shape than announced.
+    return [np.zeros(3, np.float32)]  # Not the announced shape.
 
   host_call.register("test_errors", function)
   call = jax.jit(lambda x: host_call.call("test_errors", (_shape(2),), x))
@@ -56,13 +58,12 @@ def test_errors_of_the_function_reach_the_caller():
     jax.block_until_ready(call(jnp.float32(-1)))
   with pytest.raises(Exception, match="could not broadcast"):
     jax.block_until_ready(call(jnp.float32(1)))
-  with pytest.raises(Exception, match="is none of f32"):
+  with pytest.raises(Exception, match="expected an f32 buffer"):
     jax.block_until_ready(call(jnp.int32(1)))
 
 
-def test_a_program_that_steps_worlds_names_no_address_so_that_it_can_be_cached(
-  task, resets
-):
+def test_programs_that_step_worlds_can_be_cached(task, resets):
+  """They hold no address: engines of equal settings give equal programs."""
   worlds = resets.qpos.shape[0]
   action = jnp.zeros((worlds, 6)), jnp.zeros(worlds)
 

@@ -15,7 +15,7 @@ WORLDS = 8
 
 
 def test_newton_direction_equals_stock():
-  """A box that slides over the table: some cones are on their curved side."""
+  """A box slides over the table: some contacts are on the curved side of the cone."""
   task = make_task("stack_box")
   address, dof = task.scene.free_joint("yellow")
   draw = task.sample_resets(np.random.default_rng(0), WORLDS)

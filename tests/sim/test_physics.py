@@ -1,4 +1,4 @@
-"""Both engines: same result, limits held, finite in contact."""
+"""Both engines: same result, limits kept, finite in contact."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ENGINES = ("native", "mjx")
 
 
 def play(step, state, velocities, close):
-  """States after each control period, stacked over time."""
+  """Returns the states after each control period, stacked over time."""
   states = []
   for velocity, grip in zip(velocities, close, strict=True):
     state = step(state, velocity, grip)
@@ -31,8 +31,10 @@ def play(step, state, velocities, close):
 
 @pytest.fixture(scope="module")
 def random_play(engines, resets):
-  """The start, and seven periods of the same random actions in both engines, from high
-  above the table: in contact the engines part as chaos wants."""
+  """Returns the start, and seven periods of the same random actions in both engines.
+
+  The arm starts high above the table: in contact the engines diverge chaotically.
+  """
   resets = resets.replace(qpos=resets.qpos.at[:, 1].add(-0.5))
   worlds = resets.qpos.shape[0]
   rng = np.random.default_rng(0)
@@ -43,7 +45,7 @@ def random_play(engines, resets):
 
 
 def test_engines_agree(random_play, task):
-  """Same actions, same motion."""
+  """The same actions lead to the same motion."""
   _, states = random_play
   native, mjx = states["native"], states["mjx"]
   np.testing.assert_allclose(native.qpos, mjx.qpos, atol=1e-3)
@@ -53,26 +55,26 @@ def test_engines_agree(random_play, task):
 
 
 @pytest.mark.parametrize("name", ENGINES)
-def test_a_sliding_plate_stops_as_coulomb_says(engines, task, resets, name: str):
-  """After v^2 / (2 mu g), in both engines, with the friction the MJCF states."""
+def test_a_sliding_plate_stops_by_coulomb_friction(engines, task, resets, name: str):
+  """It slides v^2 / (2 mu g) in both engines, with the friction of the MJCF."""
   plate, dof = task.scene.free_joint("plate")
   worlds = resets.qpos.shape[0]
   speed = np.linspace(0.15, 0.45, worlds)
   state = resets.replace(qvel=resets.qvel.at[:, dof].set(speed))
   for _ in range(5):
     state = engines[name](state, jnp.zeros((worlds, 6)), jnp.ones(worlds))
-  way = np.asarray(state.qpos - resets.qpos)[:, plate : plate + 3]
+  moved = np.asarray(state.qpos - resets.qpos)[:, plate : plate + 3]
   friction = 0.2
-  np.testing.assert_allclose(way[:, 0], speed**2 / (2 * friction * 9.81), rtol=0.1)
-  np.testing.assert_allclose(way[:, 1:], 0.0, atol=2e-3)
+  np.testing.assert_allclose(moved[:, 0], speed**2 / (2 * friction * 9.81), rtol=0.1)
+  np.testing.assert_allclose(moved[:, 1:], 0.0, atol=2e-3)
   assert np.abs(state.qvel[:, dof : dof + 3]).max() < 0.02
 
 
-def test_velocities_follow_the_accelerations_of_a_solver_that_has_not_converged(
-  task, resets
-):
-  """After one iteration forces are far from those that belong to the accelerations, and
-  the plate's inertia is small enough for the rest to throw it."""
+def test_free_bodies_follow_the_accelerations_of_an_unconverged_solver(task, resets):
+  """After one iteration the solver's forces do not match its accelerations.
+
+  The plate's inertia is so small that the residual would throw it.
+  """
   model = copy.copy(task.scene.model)
   model.opt.iterations = 1
   scene = dataclasses.replace(task.scene, model=model)
@@ -92,29 +94,32 @@ def test_velocities_follow_the_accelerations_of_a_solver_that_has_not_converged(
 
 @pytest.mark.parametrize("name", ENGINES)
 def test_velocity_and_acceleration_limits_hold(random_play, name: str):
+  """Random actions stay within the limits and reach that of the acceleration."""
   resets, states = random_play
   velocity = states[name].qvel[..., :6]
   assert np.abs(velocity).max() <= physics.MAX_VELOCITY + 0.02
   before = np.concatenate([np.asarray(resets.qvel[None, :, :6]), velocity[:-1]])
   acceleration = (velocity - before) / 0.15
   assert np.abs(acceleration).max() <= physics.MAX_ACCELERATION * 1.05
-  # The limit binds: random commands ask for more than it allows.
+  # The limit is active: random commands request more.
   assert np.abs(acceleration).max() > physics.MAX_ACCELERATION * 0.9
 
 
 @pytest.mark.parametrize("name", ENGINES)
 def test_commanded_velocity_is_reached(engines, resets, name: str):
-  wanted = jnp.tile(
+  """Six control periods suffice from rest."""
+  desired = jnp.tile(
     jnp.array([0.3, -0.1, 0.1, -0.2, 0.2, -0.3]), (resets.qpos.shape[0], 1)
   )
   state = resets
   for _ in range(6):
-    state = engines[name](state, wanted, jnp.ones(wanted.shape[0]))
-  np.testing.assert_allclose(state.qvel[:, :6], wanted, atol=5e-3)
+    state = engines[name](state, desired, jnp.ones(desired.shape[0]))
+  np.testing.assert_allclose(state.qvel[:, :6], desired, atol=5e-3)
 
 
 @pytest.mark.parametrize("name", ENGINES)
 def test_arm_commanded_into_the_table_stays_finite(engines, resets, task, name: str):
+  """The arm neither accelerates without bound nor penetrates the table."""
   scene = task.scene
   state = resets
   down = jnp.tile(jnp.array([0.0, 1.0, 0.3, -0.5, 0.0, 0.0]), (resets.qpos.shape[0], 1))
@@ -131,7 +136,7 @@ def test_arm_commanded_into_the_table_stays_finite(engines, resets, task, name: 
 
 @pytest.mark.parametrize("name", ENGINES)
 def test_gripper_closes_at_its_speed(engines, resets, task, name: str):
-  """The pad gap shrinks by 75 mm/s, as the maker gives it."""
+  """The pad gap shrinks by 75 mm/s, as in the manufacturer's manual."""
   scene = task.scene
   fingers = slice(scene.gripper_qpos, scene.gripper_qpos + 4)
   state = resets.replace(qpos=resets.qpos.at[:, fingers].set(0.2))
@@ -147,6 +152,7 @@ def test_gripper_closes_at_its_speed(engines, resets, task, name: str):
 
 
 def test_kinematics_agree_with_mujoco(task, resets):
+  """All poses equal those of C MuJoCo."""
   scene = task.scene
   kinematics = jax.jit(make_kinematics(scene))(resets)
   data = mujoco.MjData(scene.model)
@@ -164,7 +170,8 @@ def test_kinematics_agree_with_mujoco(task, resets):
       np.testing.assert_allclose(getattr(kinematics, name)[i], expected, atol=1e-5)
 
 
-def test_unknown_backend_is_refused(task):
+def test_an_unknown_backend_is_rejected(task):
+  """The error lists the valid backends."""
   with pytest.raises(ConfigError, match="choose from auto, mjx, native"):
     engines.make_physics("bullet", task.scene, substeps=30)
 
@@ -189,7 +196,8 @@ MINIMAL = """
     ("timestep='0.005'", "elbow", "no joint 'shoulder_pan' (valid: elbow)"),
   ],
 )
-def test_scenes_that_cannot_work_are_refused(tmp_path, option, joint, message):
+def test_unsupported_scenes_are_rejected(tmp_path, option, joint, message):
+  """The one-line error names the feature or the missing joint."""
   path = tmp_path / "scene.xml"
   path.write_text(MINIMAL.format(option=option, joint=joint))
   with pytest.raises(ConfigError) as error:
@@ -197,6 +205,7 @@ def test_scenes_that_cannot_work_are_refused(tmp_path, option, joint, message):
   assert message in str(error.value) and "\n" not in str(error.value)
 
 
-def test_missing_camera_is_named(task):
+def test_the_error_for_a_missing_camera_lists_the_others(task):
+  """So a typo is easy to find."""
   with pytest.raises(ConfigError, match="no camera 'side' .valid: .*global"):
     task.scene.id("camera", "side")

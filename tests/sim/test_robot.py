@@ -19,7 +19,7 @@ POSES = sorted(ORACLE["poses"])
 
 @pytest.fixture(scope="module")
 def bare_arm() -> tuple[mujoco.MjModel, mujoco.MjData]:
-  """The shipped scene without what hangs on the flange, like the published model."""
+  """Returns the shipped scene without the gripper, like the published model."""
   spec = mujoco.MjSpec.from_file(str(mjcf_path("push_plate")))
   spec.delete(spec.body("gripper"))
   for key in list(spec.keys):
@@ -35,7 +35,7 @@ def bare_arm() -> tuple[mujoco.MjModel, mujoco.MjData]:
 
 
 def in_base_frame(data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
-  """Flange position and rotation in the DH base frame."""
+  """Returns position and rotation of the flange in the DH base frame."""
   base, flange = data.site("base_frame"), data.site("attachment_site")
   rotation = base.xmat.reshape(3, 3).T
   return (
@@ -46,6 +46,7 @@ def in_base_frame(data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("name", POSES)
 def test_arm_agrees_with_published_model(bare_arm, name: str):
+  """Flange pose, mass matrix and bias force equal those of the published model."""
   model, data = bare_arm
   pose = ORACLE["poses"][name]
   data.qpos[:6], data.qvel[:] = pose["q"], 0
@@ -62,6 +63,7 @@ def test_arm_agrees_with_published_model(bare_arm, name: str):
 
 
 def test_jax_kinematics_agree_with_mujoco(task):
+  """Tool pose and Jacobian equal those of C MuJoCo."""
   scene, rng = task.scene, np.random.default_rng(0)
   q = rng.uniform(-3, 3, (20, 6))
   position, rotation, jacobian = arm.forward(
@@ -83,6 +85,7 @@ def test_jax_kinematics_agree_with_mujoco(task):
 
 
 def test_rotation_error_agrees_with_mujoco():
+  """Random rotations give the rotation vectors of ``mju_quat2Vel``."""
   rng = np.random.default_rng(1)
   for _ in range(20):
     quats = rng.normal(size=(2, 4))
@@ -101,7 +104,7 @@ def test_rotation_error_agrees_with_mujoco():
 
 
 def test_gripper_follows_the_closed_form(task):
-  """Pad gap and tip height of the maker's closed form, over the whole stroke."""
+  """Pad gap and height equal the manufacturer's closed form over the whole stroke."""
   model, data = task.scene.model, mujoco.MjData(task.scene.model)
   fingers = [
     model.joint(f"finger_{name}").qposadr[0] for name in ("r1", "r2", "l1", "l2")

@@ -1,5 +1,4 @@
-"""Every task's scripted expert on real physics: held-out episodes, the limits it shares
-with the agent, disturbances."""
+"""Scripted experts on real physics: success, limits of motion, disturbances."""
 
 from __future__ import annotations
 
@@ -25,14 +24,14 @@ PUSHED = {
   "push_plate": ("plate", 0.05),
   "stack_box": ("yellow", 0.03),
 }
-"""Task -> what is moved aside, and how far, m."""
+"""Task -> body that is pushed aside, and how far, m."""
 
 SWUNG = {
   "flip_cup": ("cup", 32, 0.08),
   "place_plate": ("plate", 28, 0.08),
   "stack_box": ("yellow", 22, 0.035),
 }
-"""Task -> what is turned in the hand, when, and the height in m it has by then."""
+"""Task -> body that is turned in the hand, when, and its height by then, m."""
 
 MJX = [pytest.param((n, "mjx"), marks=pytest.mark.slow) for n in task_names()]
 
@@ -47,7 +46,7 @@ def env(request) -> Env:
 
 @pytest.mark.parametrize("noise", [0.0, ReplayConfig().expert_noise])
 def test_the_expert_solves_its_task(env, noise: float):
-  """As it is, and with the noise by which it fills the replay of training."""
+  """Without noise, and with that of the expert's replay."""
   player = make_player(env, lambda _: expert_policy(env, noise=noise))
   played = play_held_out(env, player, None, episodes=32, seed=0)
   assert played.success.sum() >= 31
@@ -63,8 +62,7 @@ def play(
   step,
   disturb: Callable[[int, PhysicsState], PhysicsState] = lambda t, physics: physics,
 ) -> Iterator[EnvState]:
-  """The instants of ``WORLDS`` episodes and what follows the shorter ones; the state
-  before each period goes through ``disturb``."""
+  """Plays ``WORLDS`` episodes; ``disturb`` edits the state before each period."""
   state = env.reset(jnp.arange(WORLDS))
   for t in range(env.config.episode_steps):
     state = step(state.replace(physics=disturb(t, state.physics)), jax.random.key(t))
@@ -72,7 +70,7 @@ def play(
 
 
 def solved(instants: Iterator[EnvState]) -> int:
-  """Of the first episodes."""
+  """Counts the first episodes that are solved."""
   done, over = np.zeros(WORLDS, bool), np.zeros(WORLDS, bool)
   for state in instants:
     done |= ~over & np.asarray(state.timestep.terminated)
@@ -82,13 +80,15 @@ def solved(instants: Iterator[EnvState]) -> int:
 
 @pytest.fixture(scope="module")
 def instants(env, step) -> list[EnvState]:
-  """Undisturbed."""
+  """Undisturbed episodes."""
   return list(play(env, step))
 
 
-def test_it_moves_as_the_agent_may(env, instants):
-  """Its actions lie in the action box; robot states of the approach show the limits of
-  joints and fingers. Later on, contacts brake harder."""
+def test_the_expert_keeps_the_limits_of_the_agent(env, instants):
+  """Its actions are in the action box; joints and fingers keep their limits.
+
+  Only the approach is checked, because contacts brake harder.
+  """
   actions = np.stack([state.timestep.primitives for state in instants])
   assert np.abs(actions[..., :6]).max() <= 1.0
   assert np.isin(actions[..., 6], (0.0, 1.0)).all()
@@ -103,7 +103,7 @@ def test_it_moves_as_the_agent_may(env, instants):
 
 
 def test_success_is_rewarded_once(env, instants):
-  """With +1, as the last instant of an episode; the next is the first of another."""
+  """The reward is +1 at the last instant; the next one begins another episode."""
   reward = np.stack([state.timestep.reward for state in instants])
   solved = np.stack([state.timestep.terminated for state in instants])
   elapsed = np.stack([state.elapsed for state in instants])
@@ -113,9 +113,9 @@ def test_success_is_rewarded_once(env, instants):
 
 
 def test_the_expert_recovers_when_the_object_is_pushed_away(env, step):
-  """It is moved aside while the arm approaches."""
+  """The push happens while the arm approaches."""
   if env.task.name not in PUSHED:
-    pytest.skip("a holder is in the way, or a task of your own")
+    pytest.skip("a holder is in the way, or a user's task")
   body, far = PUSHED[env.task.name]
   address, _ = env.task.scene.free_joint(body)
   aside = jnp.asarray([far, -far]) / np.sqrt(2)
@@ -131,7 +131,7 @@ def test_the_expert_recovers_when_the_object_is_pushed_away(env, step):
 
 def test_the_expert_recovers_when_the_object_swings_in_the_hand(env, step):
   if env.task.name not in SWUNG:
-    pytest.skip("nothing is carried, or a task of your own")
+    pytest.skip("nothing is carried, or a user's task")
   body, period, height = SWUNG[env.task.name]
   address, dof = env.task.scene.free_joint(body)
 

@@ -1,4 +1,4 @@
-"""flip_cup: resets, success on hand-made states, targets through a flip."""
+"""flip_cup: resets, success on hand-made states, tool targets during a flip."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def resets(cups):
 
 @pytest.fixture(scope="module")
 def half(cups) -> np.ndarray:
-  """f64[WORLDS, 2]: half of the width and the height of each cup."""
+  """Half the width and half the height of each cup, f64[WORLDS, 2], m."""
   return cups[1]
 
 
@@ -61,7 +61,7 @@ def solved(task, resets, half):
 
 
 def on_goal(task, state, height, shift=(0.0, 0.0, 0.0), turn=UPRIGHT):
-  """The cup's center is ``height`` above the goal, and shifted from there."""
+  """Puts the cup's center ``height`` above the goal, plus ``shift``."""
   goal = np.asarray(state.mocap_pos[:, task.scene.mocap("goal")])
   where = goal + np.asarray(shift)
   where[:, 2] += height
@@ -69,14 +69,16 @@ def on_goal(task, state, height, shift=(0.0, 0.0, 0.0), turn=UPRIGHT):
 
 
 def outward(task, state) -> np.ndarray:
-  """Horizontal directions f64[WORLDS, 3] from the base to the cup."""
+  """Returns the horizontal directions f64[WORLDS, 3] from the base to the cup."""
   flat = np.asarray(pos(task, state, "cup"), np.float64) * [1, 1, 0]
   return flat / np.linalg.norm(flat, axis=-1, keepdims=True)
 
 
 def hand(task, state, kinematics, half, reach, roll, *, back=0.0, aside=0.0):
-  """A horizontal tool along ``reach`` with the cup between its pads, or so far behind
-  it and to its left; turned about itself by ``roll``."""
+  """Puts a horizontal tool along ``reach`` at a roll, with the cup between its pads.
+
+  Or ``back`` m behind that and ``aside`` m to the left.
+  """
   up = np.tile([0.0, 0.0, 1.0], (len(reach), 1))
   left = np.cross(up, reach)
   mat = np.stack([left, up, reach], -1) @ Rotation.from_euler("z", roll).as_matrix()
@@ -98,7 +100,7 @@ def test_resets_are_uniform_in_range(task, draw):
   ]
 
   def distance(pairs: np.ndarray) -> np.ndarray:
-    """By the law of cosines, of pairs of radius and direction."""
+    """Computes distances from radius and direction by the law of cosines."""
     (a, b), turn = pairs[:, ::2].T, pairs[:, 1] - pairs[:, 3]
     return np.sqrt(a**2 + b**2 - 2 * a * b * np.cos(turn))
 
@@ -161,10 +163,10 @@ def test_a_lying_cup_is_no_success(task, resets, half, kinematics):
   ("turn", "stands"),
   [(UPRIGHT, True), (UPSIDE_DOWN, False), (Rotation.from_euler("x", 0.7), False)],
 )
-def test_a_dropped_cup_counts_if_it_comes_to_stand(
+def test_a_dropped_cup_counts_if_it_lands_upright(
   task, resets, half, kinematics, rest, turn, stands
 ):
-  """It stays upright, it stays upside down, it falls over."""
+  """The cases stay upright, stay upside down, and fall over."""
   steep = abs(turn.as_euler("xyz")[0])
   lowest = half[:, 1] * abs(np.cos(steep)) + half[:, 0] * abs(np.sin(steep))
   state = on_goal(task, resets, lowest, (0.0, 0.0, 0.02), turn)
@@ -195,22 +197,22 @@ FUNNEL_WIDTH = FUNNEL - ALIGNED
 @pytest.mark.parametrize(
   ("back", "aside", "gap", "twist", "funnel"),
   [
-    # Beside: behind the cup. In the funnel: nearer. Aligned: to the cup.
+    # Out of line: behind the cup. In the funnel: nearer. Aligned: to the cup.
     (0.2, 0.1, OPEN, 0.0, 1.0),
     (0.09, -0.031, OPEN, 0.0, 0.5),
     (0.02, 0.031, OPEN, 0.0, 0.5),
     (0.09, 0.01, OPEN, 0.0, 0.0),
     (0.0, 0.0, OPEN, 0.0, 0.0),
-    # Only as far forward as the hand is turned to the cup, 0.125 rad for nothing.
+    # A twist keeps the hand back, apart from the first 0.125 rad.
     (0.09, 0.0, OPEN, 0.12, 0.0),
     (0.09, 0.0, OPEN, -0.5, (0.05 * 0.375 - 0.012) / FUNNEL_WIDTH),
-    # Fingers closed on nothing stay behind it; those that close around it stay there.
+    # Fingers closed on nothing stay behind; those closing around the cup stay there.
     (0.05, 0.0, 0.02, 0.0, 1.0),
     (0.005, 0.0, 0.079, 0.0, 0.0),
   ],
 )
 def test_object_target(task, resets, half, kinematics, back, aside, gap, twist, funnel):
-  """Square to the face of the cup that looks away from the base."""
+  """The hand is square to the face of the cup that points away from the base."""
   state, roll = with_gap(task, resets, gap), -np.pi / 2
   face = rotation(task, state, "cup").as_matrix()[:, :, 0]
   around = hand(task, state, kinematics, half, face, roll)
@@ -224,8 +226,10 @@ def test_object_target(task, resets, half, kinematics, back, aside, gap, twist, 
 
 
 @pytest.mark.parametrize("flip", [0.0, 0.8, 2.0, np.pi])
-def test_a_held_cup_is_lifted_and_turned_on(task, resets, half, kinematics, flip):
-  """From any angle of the flip, above the table: on towards upright, over the goal."""
+def test_a_held_cup_is_turned_upright_over_the_goal(
+  task, resets, half, kinematics, flip
+):
+  """From any angle of the flip, high above the table."""
   site = task.scene.tool_site
   cup = pos(task, resets, "cup").at[:, 2].set(0.25)
   reach = outward(task, resets)

@@ -1,4 +1,4 @@
-"""Headings, turns and funnels against scipy's rotations and by their definition."""
+"""Headings, rotations and funnels against scipy and their definitions."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from apnpql_jax.tasks import geometry
 
 
 def same_angle(actual, desired, atol: float) -> None:
-  """Compares angles as points of the circle."""
+  """Checks that angles are equal as points of the circle."""
   difference = np.asarray(actual, np.float64) - desired
   np.testing.assert_allclose(np.sin(difference), 0, atol=atol)
   assert (np.cos(difference) > 0).all()
 
 
 def test_yaw_is_the_heading_of_the_x_axis():
-  """Any orientation, unless the x axis is so steep that it has no heading."""
+  """For any orientation whose x axis is not too steep to have a heading."""
   rotation = Rotation.random(2000, rng=np.random.default_rng(0))
   mat = rotation.as_matrix()
   level = np.hypot(mat[:, 0, 0], mat[:, 1, 0]) > 0.1
@@ -54,30 +54,30 @@ def test_fold_is_the_nearest_equivalent(period):
   assert np.abs(folded).max() <= period / 2 + 1e-5
   turns = (angle - folded) / period
   np.testing.assert_allclose(turns, np.round(turns), atol=1e-5)
-  # Nearest to zero, by trying all: scipy knows nothing of shapes that repeat.
+  # Nearest to zero among all equivalents.
   every = angle[:, None] + period * np.arange(-14, 15)
   np.testing.assert_allclose(np.abs(folded), np.abs(every).min(1), atol=1e-5)
 
 
-def test_fold_leaves_what_is_folded():
+def test_fold_keeps_folded_angles():
   angle = jnp.array([-0.78, -0.3, 0.0, 0.3, 0.78])
   np.testing.assert_array_equal(geometry.fold(angle, np.pi / 2), angle)
 
 
-def test_turn_z_is_scipys_rotation():
+def test_rotation_z_is_scipys_rotation():
   angle = np.random.default_rng(2).uniform(-7, 7, 60)
   expected = Rotation.from_euler("z", angle[:, None]).as_matrix()
-  turned = geometry.turn_z(jnp.asarray(angle, jnp.float32).reshape(20, 3))
+  turned = geometry.rotation_z(jnp.asarray(angle, jnp.float32).reshape(20, 3))
   np.testing.assert_allclose(turned, expected.reshape(20, 3, 3, 3), atol=1e-6)
 
 
-def test_turning_turns_the_heading():
-  """turn_z and yaw have the same sense."""
+def test_a_rotation_adds_to_the_heading():
+  """rotation_z and yaw have the same sign."""
   rotation = Rotation.from_euler(
     "zyx", np.random.default_rng(3).uniform(-0.5, 0.5, (50, 3))
   )
   before = jnp.asarray(rotation.as_quat(scalar_first=True), jnp.float32)
-  turn = np.asarray(geometry.turn_z(jnp.full(50, 0.7)))
+  turn = np.asarray(geometry.rotation_z(jnp.full(50, 0.7)))
   after = (Rotation.from_matrix(turn) * rotation).as_quat(scalar_first=True)
   difference = geometry.yaw(jnp.asarray(after, jnp.float32)) - geometry.yaw(before)
   same_angle(difference, 0.7, atol=1e-5)
@@ -101,18 +101,18 @@ def test_funnel_at_its_ends_and_between(off, expected):
 
 
 @pytest.mark.parametrize("height", [0.3, np.array([0.3, 0.4])])
-def test_up_adds_a_height(height):
+def test_at_height_adds_a_height(height):
   xy = jnp.array([[1.0, 2.0], [3.0, 4.0]])
   expected = np.column_stack([xy, np.broadcast_to(height, 2)])
-  np.testing.assert_allclose(geometry.up(xy, height), expected, rtol=1e-6)
+  np.testing.assert_allclose(geometry.at_height(xy, height), expected, rtol=1e-6)
 
 
-def test_rest_is_slow_in_every_direction_and_about_every_axis():
+def test_rest_limits_every_direction_and_axis():
   dof, speed, rests = map(np.array, zip(*MOTIONS, strict=True))
   twist = np.zeros((len(dof), 6), np.float32)
   twist[np.arange(len(dof)), dof] = speed
   np.testing.assert_array_equal(geometry.is_at_rest(jnp.asarray(twist)), rests)
-  # Speeds add up as vectors do; turning and moving do not.
+  # Components add up as vectors; turning and moving are separate.
   for twist, expected in (
     ([0.04, 0.04, 0, 0, 0, 0], False),
     ([0, 0, 0, 0.4, 0, -0.4], False),

@@ -1,4 +1,4 @@
-"""The hand as tasks see it, against the linkage in the shipped MJCF."""
+"""The hand as tasks see it, compared with the linkage in the shipped MJCF."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ FINGERS = ("finger_r1", "finger_r2", "finger_l1", "finger_l2")
 GAPS = (0.005, 0.012, 0.03, 0.05, 0.075, 0.1)
 
 WIDTH, ABOVE = 0.05, 0.004
-"""m; what the pinch of these tests grips, and where."""
+"""m; width of the gripped object and height of the grasp in these tests."""
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def robot() -> mujoco.MjModel:
 
 
 def hand_at(model: mujoco.MjModel, gap: float, arm=(0.3, -1.0, 1.2, -0.4, -0.9, 0.5)):
-  """C MuJoCo's kinematics with the pads ``gap`` apart, the arm anywhere."""
+  """Computes C MuJoCo's kinematics with the pads ``gap`` m apart."""
   data = mujoco.MjData(model)
   data.qpos[:6] = arm
   for name in FINGERS:
@@ -52,7 +52,7 @@ def hand_at(model: mujoco.MjModel, gap: float, arm=(0.3, -1.0, 1.2, -0.4, -0.9, 
 
 
 def pads(data: mujoco.MjData) -> np.ndarray:
-  """Pads' centers in the frame of the tool, f64[2, 3]: right, left."""
+  """Returns the centers of the right and left pad in the tool's frame, f64[2, 3]."""
   tool = data.site("tool")
   centers = np.stack([data.geom("r_pad").xpos, data.geom("l_pad").xpos])
   return (centers - tool.xpos) @ tool.xmat.reshape(3, 3)
@@ -73,7 +73,7 @@ def test_finger_angle_sets_the_distance_of_the_pads_faces(robot, gap):
 
 
 @pytest.mark.parametrize("gap", GAPS)
-def test_pinch_height_is_the_way_back_from_the_tool(robot, gap):
+def test_pinch_height_is_the_distance_back_from_the_tool(robot, gap):
   right, left = pads(hand_at(robot, gap))
   assert -(right[2] + left[2]) / 2 == pytest.approx(float(pinch_height(gap)), abs=1e-6)
 
@@ -87,7 +87,7 @@ def test_every_gap_lies_within_the_joints_range(robot):
 
 @pytest.fixture(scope="module")
 def stack_box():
-  """Any scene with a robot would do."""
+  """A scene; any with a robot would do."""
   return make_task("stack_box")
 
 
@@ -125,7 +125,7 @@ def resets(stack_box) -> physics.PhysicsState:
 
 
 def hands(scene, resets, gaps, wrist=0.0) -> physics.PhysicsState:
-  """Worlds in the neutral configuration but for the fingers and the last joint."""
+  """Returns neutral worlds with given finger gaps and offsets of the last joint."""
   qpos = np.tile(scene.keyframe("neutral"), (len(gaps), 1))
   for name in FINGERS:
     qpos[:, scene.model.joint(name).qposadr[0]] = [finger_angle(gap) for gap in gaps]
@@ -149,7 +149,7 @@ def test_the_point_is_where_the_pads_meet_their_object(scene, resets, pinch, for
 def test_twist_is_the_hands_heading_less_the_objects(
   scene, resets, pinch, forward, period
 ):
-  """The neutral hand points down: the last joint turns it the other way round."""
+  """The neutral hand points down, so that the last joint turns it in reverse."""
   wrist = np.array([-1.2, -0.3, 0.0, 0.2, 0.7, 1.5])
   kinematics = forward(hands(scene, resets, [WIDTH] * 6, wrist))
   turn = -wrist - 0.1
@@ -182,7 +182,7 @@ def test_widths_may_differ_between_worlds(scene, resets):
   )
 
 
-def test_it_holds_what_is_as_wide_as_the_gap(scene, resets, pinch, forward):
+def test_it_holds_objects_as_wide_as_the_gap(scene, resets, pinch, forward):
   wider = np.array([0.03, TOLERANCE + 5e-4, TOLERANCE - 5e-4, 0.0, 5e-4 - TOLERANCE])
   gaps = WIDTH + np.append(wider, -TOLERANCE - 5e-4)
   state = hands(scene, resets, gaps)
@@ -207,7 +207,7 @@ def test_it_holds_and_closes_only_close_by(scene, resets, pinch, forward, axis):
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_a_turned_hand_may_not_close(scene, resets, pinch, forward, sign):
+def test_a_twisted_hand_may_not_close(scene, resets, pinch, forward, sign):
   kinematics = forward(hands(scene, resets, [0.1] * 6))
   twist = sign * jnp.array([0.0, 0.5, 0.9, 1.1, 2.0, 10.0]) * STRAIGHT
   around = pinch.around(kinematics, pinch.point(kinematics), twist)
@@ -226,7 +226,7 @@ RULES = (
 
 
 @pytest.mark.parametrize("withdraw", [1, 2])
-def test_pick_and_place_does_one_thing_in_each_case(withdraw):
+def test_pick_and_place_has_one_rule_for_each_case(withdraw):
   table = {case: rule[4:] for rule in RULES for case in itertools.product(*rule[:4])}
   assert len(table) == 16 == sum(np.prod([len(x) for x in rule[:4]]) for rule in RULES)
   cases = jnp.array(list(table))

@@ -46,7 +46,7 @@ def task():
 
 
 def lying(steep=0.0, heading=0.0) -> Rotation:
-  """A plate whose axis is ``steep`` away from the vertical, towards ``heading``."""
+  """Returns the rotation of a plate tilted by ``steep`` towards ``heading``."""
   return Rotation.from_euler("ZY", [heading, steep])
 
 
@@ -61,7 +61,7 @@ def mocap(task, state, body) -> tuple[np.ndarray, Rotation]:
 
 
 def in_box(task, state, where, turn: Rotation = STANDING):
-  """Puts the plate into the box's frame."""
+  """Puts the plate at a pose in the box's frame."""
   origin, frame = mocap(task, state, "goal")
   return put(task, state, "plate", origin + frame.apply(where), frame * turn)
 
@@ -72,7 +72,7 @@ def moved(task, state, body, shift):
 
 
 def hand_at(task, state, kinematics, neutral, shift=(0.0, 0.0, 0.0), twist=0.0):
-  """A vertical tool at ``shift`` from its grasp of a standing plate, turned."""
+  """Puts a vertical tool at ``shift`` from its grasp of a standing plate, twisted."""
   where = (
     pos(task, state, "plate") + jnp.array([0.0, 0.0, RIM + GRASP]) + jnp.array(shift)
   )
@@ -84,7 +84,7 @@ def hand_at(task, state, kinematics, neutral, shift=(0.0, 0.0, 0.0), twist=0.0):
 
 @pytest.fixture(scope="module")
 def solved(task, resets):
-  """All worlds with the plate at rest in the middle of the box, on its edge."""
+  """Worlds with the plate at rest on its edge in the middle of the box."""
   return in_box(task, resets, (0.0, 0.0, RADIUS))
 
 
@@ -100,7 +100,7 @@ def test_the_hand_is_open(task, draw):
   assert not draw.qpos[:, start : start + 4].any()
 
 
-def test_what_is_drawn_is_independent(task, draw):
+def test_draws_are_independent(task, draw):
   turns = [mocap(task, draw, body)[1].as_rotvec() for body in ("holder", "goal")]
   turns = np.stack([turn[:, 2] for turn in turns])
   correlation = np.corrcoef(np.vstack([draw.qpos[:, task.scene.arm_qpos].T, turns]))
@@ -168,7 +168,7 @@ LEAN = np.array([0.0, 0.0, RADIUS * np.sin(1.0) + FLOOR * np.cos(1.0)])
   ],
 )
 def test_a_plate_in_the_box_is_success(task, resets, kinematics, turn, where):
-  """On its edge, on either side, or leaning: wherever it comes to rest."""
+  """On its edge, on either side, or leaning."""
   assert judge(task, in_box(task, resets, where, turn), kinematics).all()
 
 
@@ -219,7 +219,7 @@ def test_it_must_be_on_the_floor_of_the_box(
 
 
 def test_the_goal_is_where_the_box_is(task, resets, solved, kinematics):
-  """Not where it was, and not the holder."""
+  """The goal is not a fixed place, and not the holder."""
   assert not judge(task, moved(task, solved, "goal", (0.2, 0, 0)), kinematics).any()
   assert judge(task, moved(task, solved, "holder", (0.2, 0, 0)), kinematics).all()
   origin, frame = mocap(task, resets, "holder")
@@ -241,7 +241,7 @@ def test_a_moving_plate_is_no_success(task, solved, kinematics, dof, speed, rest
 def test_the_hand_must_be_away(
   task, resets, kinematics, neutral, turn, axis, distance, expected
 ):
-  """Outside of the circle where it could grip, by 5 cm, in any direction."""
+  """It must be 5 cm outside the circle of grasps, in any direction."""
   tilt = turn.as_matrix()[2, 2]
   height = RADIUS * np.sqrt(1 - tilt**2)
   state = in_box(task, resets, (0.0, 0.0, height), turn)
@@ -268,13 +268,13 @@ def test_a_plate_let_go_in_the_box_stays_in_it(
 
 
 def test_a_plate_dropped_on_a_wall_does_not_count(task, resets, kinematics, rest):
-  """It comes to rest outside, or leaning on the wall with its center above it."""
+  """It comes to rest outside, or leans on the wall with its center above it."""
   state = rest(in_box(task, resets, (0.20, 0.0, 0.08), lying()))
   assert not judge(task, state, kinematics).any()
 
 
 def edge(task, state):
-  """Highest point of a circle just inside the plate's edge, by trying all."""
+  """Finds the highest point of a circle just inside the plate's edge."""
   mat = rotation(task, state, "plate").as_matrix()
   angle = np.linspace(0, 2 * np.pi, 20001)
   circle = RIM * np.stack([np.cos(angle), np.sin(angle), 0 * angle])
@@ -296,7 +296,7 @@ FUNNEL_WIDTH = FUNNEL - ALIGNED
     ((0.031, 0.0, 0.02), OPEN, 0.0, 0.5),
     ((-0.01, 0.0, 0.07), OPEN, 0.0, 0.0),
     ((0.0, 0.0, 0.0), OPEN, 0.0, 0.0),
-    # Only as far down as the fingers are turned across the plate, 0.06 rad for nothing.
+    # A twist keeps the hand up, apart from the first 0.06 rad.
     ((0.0, 0.0, 0.07), OPEN, 0.5, (0.05 * 0.44 - 0.012) / FUNNEL_WIDTH),
     ((0.0, 0.02, 0.07), OPEN, -0.3, (0.02 + 0.05 * 0.24 - 0.012) / FUNNEL_WIDTH),
     ((0.0, 0.0, 0.07), OPEN, 0.5 * np.pi, 1.0),
@@ -304,10 +304,10 @@ FUNNEL_WIDTH = FUNNEL - ALIGNED
     # Fingers closed on nothing do not descend.
     ((0.0, 0.0, 0.05), 0.025, 0.0, 1.0),
     ((0.0, 0.0, 0.05), THICKNESS, 0.0, 1.0),
-    # Fingers that close around the plate stay, unless they are turned away from it.
+    # Fingers that close around the plate stay, unless they are twisted.
     ((0.0, 0.0, 0.005), 0.025, 0.05, 0.0),
     ((0.0, 0.0, 0.0), 0.025, 0.2, 1.0),
-    # So do those that have it, also if they have slipped by 2 cm.
+    # So do those that hold it, even after a slip of 2 cm.
     ((0.0, 0.0, 0.0), THICKNESS, 0.0, 0.0),
     ((0.0, 0.02, 0.0), THICKNESS, 0.0, 0.008 / FUNNEL_WIDTH),
     ((0.0, 0.03, 0.0), THICKNESS, 0.0, 1.0),
@@ -333,14 +333,14 @@ def test_a_leaning_plate_is_gripped_at_its_highest_edge(
   hand = tool_at(task, kinematics, tool, turn @ neutral[1])
   positions, rotations, _ = task.tool_targets(state, hand)
   np.testing.assert_allclose(positions[:, 0], tool, atol=3e-5)
-  # The hand is turned across the plate already, up to half a turn.
+  # The hand is already across the plate, up to half a turn.
   closing = np.asarray(rotations[:, 0, :, 1]) @ (turn @ neutral[1])[:, 1]
   np.testing.assert_allclose(np.abs(closing), 1, atol=1e-4)
 
 
 @pytest.mark.parametrize("steep", [0.0, 1e-4, np.pi])
 def test_a_lying_plate_has_its_middle_as_target(task, resets, kinematics, steep):
-  """It has no highest edge; what matters is that the target does not jump or break."""
+  """It has no highest edge; the target must not jump and must be finite."""
   state = put(task, resets, "plate", turn=lying(steep))
   high = tool_at(task, kinematics, jnp.array([0.5, 0.0, 0.3]))
   positions, rotations, _ = task.tool_targets(state, high)
@@ -378,13 +378,13 @@ def test_a_low_tool_that_is_away_rises(
 @pytest.mark.parametrize(
   ("away", "height", "free", "far"),
   [
-    # In its holder only up; sideways the more, the higher it is.
+    # In its holder only up; sideways with increasing height.
     (0.3, 0.0, 0.0, 1.0),
     (0.3, 0.005, 0.0, 1.0),
     (0.3, 0.0225, 0.5, 1.0),
     (0.3, 0.04, 1.0, 1.0),
     (-0.2, 0.1, 1.0, 1.0),
-    # Near its place lower, and it may be low there.
+    # Lower near its place, where it may be low.
     (0.028, 0.0425, 1.0, 0.5),
     (0.028, 0.0, 0.5, 0.5),
     (0.005, 0.04, 1.0, 0.0),
@@ -395,7 +395,7 @@ def test_a_low_tool_that_is_away_rises(
 def test_a_held_plate_is_carried_into_the_box(
   task, resets, kinematics, neutral, away, height, free, far, slip
 ):
-  """The plate, not the tool, arrives at the goal: 3 mm above the floor at last."""
+  """The plate, not the tool, reaches the goal, finally 3 mm above the floor."""
   goal, frame = mocap(task, resets, "goal")
   start = goal + [0.0, away, RADIUS + height]
   state = with_gap(task, put(task, resets, "plate", start), THICKNESS)
@@ -405,7 +405,7 @@ def test_a_held_plate_is_carried_into_the_box(
   expected = start + free * (goal - start)
   expected[:, 2] = RADIUS + 0.003 + place_plate.LIFT * far
   np.testing.assert_allclose(start + step, expected, atol=1e-5)
-  # A plate that is not free yet is not turned; a free one is, across the box.
+  # A plate is turned across the box only once it is free.
   plate = rotation(task, state, "plate").as_matrix()[:, :, 2]
   axis = frame.as_matrix()[:, :, 0] if free == 1 else plate
   closing = np.asarray(rotations[:, 1, :, 1])
@@ -424,7 +424,7 @@ def test_an_empty_hand_goes_above_the_box(task, resets, kinematics):
 
 @pytest.mark.parametrize("heading", [0.0, 1.4, 1.8, -2.5, 3.0])
 def test_the_fingers_close_across_the_plate(task, resets, kinematics, neutral, heading):
-  """Of two ways, on that which is less turned from neutral; the tool points down."""
+  """Of two ways the one nearer to neutral; the tool points down."""
   state = put(
     task, resets, "plate", pos(task, resets, "plate"), lying(np.pi / 2, heading)
   )

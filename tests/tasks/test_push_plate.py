@@ -1,4 +1,4 @@
-"""push_plate: resets, success on hand-made states, privileged quantities."""
+"""push_plate: resets, success on hand-made states, tool targets."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from apnpql_jax.tasks import push_plate
 
 @pytest.fixture(scope="module")
 def solved(task, resets):
-  """All worlds with the plate at rest exactly on the goal."""
+  """Worlds with the plate at rest exactly on the goal."""
   goal = resets.mocap_pos[:, task.scene.mocap("goal"), :2]
   plate = pos(task, resets, "plate").at[:, :2].set(goal)
   return put(task, resets, "plate", plate)
@@ -82,7 +82,7 @@ def test_the_plate_must_lie_flat(task, solved, axis, angle, expected):
 
 
 def test_a_plate_that_lies_upside_down_is_no_success(task, solved, rest):
-  """Only its floor touches the table, so that its center is as low as ever."""
+  """Only its floor touches the table, so that its center is as low as when upright."""
   state = rest(turned(task, solved, "x", np.pi))
   np.testing.assert_allclose(pos(task, state, "plate")[:, 2], 0.003, atol=1e-3)
   assert not judge(task, state).any()
@@ -123,9 +123,9 @@ def test_targets_depend_on_where_the_tool_is(task, resets, kinematics):
   way = np.asarray(goal - spot)
   cosine = (step * way).sum(-1) / (lengths * np.linalg.norm(way, axis=-1))
   np.testing.assert_allclose(cosine, 1.0, atol=1e-5)
-  beside = targets(spot + 0.15, push_plate.DRAG_HEIGHT)
-  np.testing.assert_allclose(beside[:, 0, :2], spot + 0.15, atol=1e-6)
-  np.testing.assert_allclose(beside[:, :2, 2], push_plate.HOVER_HEIGHT)
+  outside = targets(spot + 0.15, push_plate.DRAG_HEIGHT)
+  np.testing.assert_allclose(outside[:, 0, :2], spot + 0.15, atol=1e-6)
+  np.testing.assert_allclose(outside[:, :2, 2], push_plate.HOVER_HEIGHT)
 
 
 def test_objects_are_the_poses(task, resets):

@@ -1,4 +1,4 @@
-"""Drawn initial states of every task, and the primitive that leads back to them."""
+"""Drawn initial states of every task, and the neutral primitive."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def task(request):
   return make_task(request.param)
 
 
-def test_the_robot_is_clear_and_nothing_is_inside_anything(task, draw):
-  """By C MuJoCo."""
+def test_the_robot_is_clear_and_nothing_overlaps(task, draw):
+  """Distances are those of C MuJoCo."""
   model, variants = copy.copy(task.scene.model), task.scene.variants
   data = mujoco.MjData(model)
   solid = np.union1d(model.pair_geom1, model.pair_geom2)

@@ -41,7 +41,7 @@ def task():
 
 @pytest.fixture(scope="module")
 def solved(task, resets):
-  """All worlds with the yellow box at rest exactly on the blue one."""
+  """Worlds with the yellow box at rest exactly on the blue one."""
   return put(task, resets, "yellow", pos(task, resets, "blue") + jnp.array(ON_BLUE))
 
 
@@ -50,12 +50,12 @@ def moved(task, state, body, shift):
 
 
 def turned(task, state, body, turn: Rotation):
-  """Turned in its own frame."""
+  """Turns a box about its own axes."""
   return put(task, state, body, turn=rotation(task, state, body) * turn)
 
 
 def hand_at(task, state, kinematics, neutral, shift, twist=0.0):
-  """A vertical tool at ``shift`` from its grasp of yellow, turned by ``twist``."""
+  """Puts a vertical tool at ``shift`` from its grasp of yellow, twisted."""
   where = pos(task, state, "yellow") + jnp.array([0.0, 0.0, GRASP]) + jnp.array(shift)
   heading = rotation(task, state, "yellow").as_euler("ZYX")[:, :1]
   turn = Rotation.from_euler("z", heading + twist).as_matrix()
@@ -69,14 +69,14 @@ def test_turns_are_uniform_in_range(task, draw):
     assert_uniform(turn[:, 2], -stack_box.MAX_YAW, stack_box.MAX_YAW)
 
 
-def test_what_is_drawn_is_independent(task, draw):
+def test_draws_are_independent(task, draw):
   turns = [rotation(task, draw, body).as_rotvec() for body in ("yellow", "blue")]
   turns = np.stack([turn[:, 2] for turn in turns])
   correlation = np.corrcoef(np.vstack([draw.qpos[:, task.scene.arm_qpos].T, turns]))
   np.testing.assert_allclose(correlation, np.eye(8), atol=0.07)  # Over four sigma.
 
 
-def test_the_pair_is_uniform_where_it_may_be(task, draw):
+def test_spots_are_uniform_among_pairs_that_are_far_apart(task, draw):
   spots = np.hstack(
     [draw.qpos[:, a : a + 2] for a, _ in map(task.scene.free_joint, ("yellow", "blue"))]
   )
@@ -85,7 +85,7 @@ def test_the_pair_is_uniform_where_it_may_be(task, draw):
   assert_pairs_are_uniform(spots, low, high, distance=apart, least=least)
 
 
-def test_the_rest_of_a_reset_is_the_keyframe(task, draw):
+def test_everything_else_in_a_reset_is_the_keyframe(task, draw):
   varied = list(task.scene.arm_qpos)
   for body in ("yellow", "blue"):
     address, _ = task.scene.free_joint(body)
@@ -133,7 +133,7 @@ def test_yellow_at_rest_on_blue_is_success(task, solved, kinematics):
     ((0.0, 0.0, -0.004), True),
     ((0.0, 0.0, -0.006), False),
     ((0.0, 0.0, 0.1), False),  # Held in the air.
-    ((0.05, 0.0, -0.05), False),  # Beside the blue box.
+    ((0.05, 0.0, -0.05), False),  # Next to the blue box.
     ((0.0, 0.0, -0.1), False),  # Below it.
   ],
 )
@@ -156,7 +156,7 @@ def test_blue_on_yellow_is_no_success(task, resets, kinematics):
   assert not judge(task, state, kinematics).any()
 
 
-def test_the_stack_may_have_moved_but_only_as_a_whole(task, solved, kinematics):
+def test_the_stack_may_move_as_a_whole(task, solved, kinematics):
   pushed = moved(task, solved, "blue", (0.06, -0.03, 0.0))
   assert not judge(task, pushed, kinematics).any()
   together = moved(task, pushed, "yellow", (0.06, -0.03, 0.0))
@@ -168,14 +168,14 @@ def test_the_stack_may_have_moved_but_only_as_a_whole(task, solved, kinematics):
   ("axis", "angle"), [("x", np.pi), ("y", np.pi / 2), ("x", -np.pi / 2), ("z", 0.8)]
 )
 def test_a_box_may_lie_on_any_face(task, solved, kinematics, body, axis, angle):
-  """Its faces look the same."""
+  """All faces look the same."""
   state = turned(task, solved, body, Rotation.from_euler(axis, angle))
   assert judge(task, state, kinematics).all()
 
 
 @pytest.mark.parametrize("angle", [0.35, np.pi / 4])
 def test_a_yellow_box_that_is_tipped_is_no_success(task, solved, kinematics, angle):
-  """With an edge on the blue box: its center is higher than that of a lying one."""
+  """It stands on an edge, which raises its center."""
   height = stack_box.SIDE / 2 * (np.cos(angle) + np.sin(angle) - 1)
   state = turned(task, solved, "yellow", Rotation.from_euler("y", angle))
   state = moved(task, state, "yellow", (0.0, 0.0, height))
@@ -206,7 +206,7 @@ def test_a_box_that_is_still_held_is_no_success(task, solved, kinematics, neutra
 
 
 def test_a_stack_at_the_tolerance_stands(task, solved, kinematics, rest):
-  """What counts as solved stays so."""
+  """A solved state remains solved."""
   state = moved(task, solved, "yellow", (0.0, 0.019, 0.0))
   assert judge(task, rest(state), kinematics).all()
 
@@ -218,8 +218,10 @@ def test_a_stack_at_the_tolerance_stands(task, solved, kinematics, rest):
 def test_a_dropped_box_counts_when_it_has_landed(
   task, solved, kinematics, rest, off, stands
 ):
-  """From 2 cm above the blue one, and from beyond its edge. With 20 iterations of its
-  line search C MuJoCo throws every other box that falls so."""
+  """It falls from 2 cm, over the blue box or beyond its edge.
+
+  With 20 iterations of its line search C MuJoCo throws every other box.
+  """
   state = moved(task, solved, "yellow", (0.0, off, 0.02))
   assert not judge(task, state, kinematics).any()
   assert (judge(task, rest(state), kinematics) == stands).all()
@@ -237,7 +239,7 @@ FUNNEL_WIDTH = FUNNEL - ALIGNED
     ((0.031, 0.0, 0.02), OPEN, 0.0, 0.5),
     ((-0.01, 0.0, 0.07), OPEN, 0.0, 0.0),
     ((0.0, 0.0, 0.0), OPEN, 0.0, 0.0),
-    # Only as far down as the fingers are turned to the faces, 0.125 rad for nothing.
+    # A twist keeps the hand up, apart from the first 0.125 rad.
     ((0.0, 0.0, 0.07), OPEN, 0.12, 0.0),
     ((0.0, 0.0, 0.07), OPEN, 0.6, (0.05 * 0.475 - 0.012) / FUNNEL_WIDTH),
     ((0.0, 0.02, 0.07), OPEN, -0.3, (0.02 + 0.05 * 0.175 - 0.012) / FUNNEL_WIDTH),
@@ -245,11 +247,11 @@ FUNNEL_WIDTH = FUNNEL - ALIGNED
     # Fingers closed on nothing do not descend.
     ((0.0, 0.0, 0.07), 0.02, 0.0, 1.0),
     ((0.0, 0.0, 0.07), 0.07, 0.0, 1.0),
-    # Fingers that close around the box stay, unless they are turned away from it.
+    # Fingers that close around the box stay, unless they are twisted.
     ((0.0, 0.0, 0.005), 0.07, 0.05, 0.0),
     ((0.0, 0.0, 0.0), 0.07, 0.2, 0.0),
     ((0.0, 0.0, 0.0), 0.07, 0.3, 1.0),
-    # So do those that have it, also if they have slipped by 2 cm.
+    # So do those that hold it, even after a slip of 2 cm.
     ((0.0, 0.0, 0.0), stack_box.SIDE, 0.0, 0.0),
     ((0.02, 0.0, 0.0), stack_box.SIDE, 0.0, 0.008 / FUNNEL_WIDTH),
     ((0.03, 0.0, 0.0), stack_box.SIDE, 0.0, 1.0),
@@ -279,7 +281,7 @@ def test_object_target(task, resets, kinematics, neutral, shift, gap, twist, fun
 def test_a_low_tool_that_is_away_rises(
   task, resets, kinematics, row, body, gap, off, height, rises
 ):
-  """By x, the boxes being further apart than that."""
+  """The offset is along x, and smaller than the distance of the boxes."""
   tool = pos(task, resets, body).at[:, 0].add(off).at[:, 2].set(height)
   state = with_gap(task, resets, gap)
   positions, *_ = task.tool_targets(state, tool_at(task, kinematics, tool))
@@ -313,7 +315,7 @@ def test_an_empty_hand_goes_above_the_goal(task, resets, kinematics, neutral):
 def test_a_held_box_is_carried_onto_the_blue_one(
   task, resets, kinematics, neutral, shift, lift, slip
 ):
-  """The box, not the tool, arrives at the goal: 1 mm above the blue one at last."""
+  """The box, not the tool, reaches the goal, finally 1 mm above the blue one."""
   blue = pos(task, resets, "blue")
   state = put(task, resets, "yellow", blue + jnp.array(shift))
   state = with_gap(task, state, stack_box.SIDE)
@@ -330,7 +332,7 @@ def test_a_held_box_is_carried_onto_the_blue_one(
 
 @pytest.mark.parametrize("turn", [0.0, 1.0, 2.5, -2.0])
 def test_the_fingers_close_on_faces(task, resets, kinematics, neutral, turn):
-  """Of four ways, on that which is least turned from neutral; the tool points down."""
+  """Of four ways the one nearest to neutral; the tool points down."""
   state = turned(task, resets, "yellow", Rotation.from_euler("z", turn))
   target = np.asarray(task.tool_targets(state, kinematics)[1])[:, 0]
   np.testing.assert_allclose(target[:, 2, 2], -1, atol=1e-3)
@@ -341,7 +343,7 @@ def test_the_fingers_close_on_faces(task, resets, kinematics, neutral, turn):
 
 
 def faces(task, state, body) -> np.ndarray:
-  """Center of the box and 0.2 m along its axis nearest to the world's x axis."""
+  """Returns the center and a point 0.2 m along the axis nearest to the world's x."""
   mat = rotation(task, state, body).as_matrix()
   normals = np.concatenate([mat, -mat], axis=-1)  # f64[n, 3, 6]
   nearest = normals[:, 0].argmax(-1)
@@ -355,7 +357,7 @@ def faces(task, state, body) -> np.ndarray:
 )
 @pytest.mark.parametrize("turn", [0.0, 0.7, 1.2, 2.9, -2.0])
 def test_objects_are_the_boxes_and_their_faces(task, resets, turn, face):
-  """Whichever face they lie on, not quite flat."""
+  """On any face, and not exactly flat."""
   state = resets
   for body in ("yellow", "blue"):
     lying = Rotation.from_euler("z", turn) * Rotation.from_euler(*face)
@@ -373,7 +375,7 @@ def test_objects_are_the_boxes_and_their_faces(task, resets, turn, face):
     ("table", stack_box.SIDE, 0.0, 1, 1),  # Carry.
     ("blue", stack_box.SIDE, 0.0, 0, 0),  # Let go.
     ("blue", OPEN, 0.0, 2, 0),  # Withdraw.
-    ("blue's edge", stack_box.SIDE, 0.0, 1, 1),  # Not good enough to let go.
+    ("blue's edge", stack_box.SIDE, 0.0, 1, 1),  # Too far off to let go.
   ],
 )
 def test_the_expert_picks_and_places(

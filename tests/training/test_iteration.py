@@ -1,7 +1,7 @@
-"""The iteration and the state it moves on: repeatable, saved whole, and safe from NaN.
+"""The training iteration: repeatable, resumable and robust against NaN.
 
-One compiled iteration serves all tests. Values that are not finite are put into real
-states; the slow variants do everything for other algorithms, engines and observations.
+One compiled iteration serves all tests. Non-finite values are put into real states. The
+slow variants repeat everything for other algorithms, engines and observations.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ WORLDS, LENGTH = testing.TINY.env.worlds, testing.TINY.rollout_length
 
 
 class Built(NamedTuple):
-  """What is expensive to make."""
+  """Objects that are expensive to build."""
 
   config: TrainConfig
   env: Env
@@ -79,13 +79,13 @@ def built(request) -> Built:
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path, monkeypatch):
-  """C MuJoCo writes a log into the present folder when a world is not finite."""
+  """Changes the folder: C MuJoCo writes a log there if a world is not finite."""
   monkeypatch.chdir(tmp_path)
 
 
 @pytest.fixture
 def iteration(built):
-  """The iteration on a copy, which spares the original from being donated."""
+  """Returns the iteration on a copy of the state, so as not to donate the original."""
   return lambda state: built.iteration(jax.tree.map(jnp.copy, state))
 
 
@@ -101,14 +101,14 @@ def _bits(tree: Any) -> list[bytes]:
 
 
 def _break_world(state: TrainState, field: str, value: float) -> TrainState:
-  """World 1 with ``value`` in the first number of a field of its physics."""
+  """Sets the first number of a physics field of world 1 to ``value``."""
   broken = getattr(state.env.physics, field).at[1, 0].set(value)
   physics = state.env.physics.replace(**{field: broken})
   return state.replace(env=state.env.replace(physics=physics))
 
 
 def _poison_replay(state: TrainState) -> TrainState:
-  """Rewards of both replays that are not numbers."""
+  """Sets the rewards of both replays to NaN."""
 
   def poison(ring: replay.Replay) -> replay.Replay:
     timestep = ring.slots.timestep
@@ -122,15 +122,13 @@ def _poison_replay(state: TrainState) -> TrainState:
 
 
 def _poison_learner(state: TrainState) -> TrainState:
-  """Primitives so far off that the gradient of their loss is not a number."""
+  """Sets the primitives so far off that the gradient of their loss is NaN."""
   params = dict(state.learner.params)
   params["ap"] = jax.tree.map(lambda x: x + jnp.inf, params["ap"])
   return state.replace(learner=state.learner.replace(params=params))
 
 
-def test_the_state_keeps_its_types_so_that_one_compilation_serves_every_iteration(
-  built,
-):
+def test_the_state_keeps_its_types_so_that_it_compiles_once(built):
   agent = make_agent(built.config.agent)
   start = jax.eval_shape(
     lambda: initial_state(built.config, built.env, agent, empty_expert)
@@ -144,8 +142,8 @@ def test_the_state_keeps_its_types_so_that_one_compilation_serves_every_iteratio
   assert types(start) == types(after)
 
 
-def test_the_slow_average_of_the_weights_acts(iteration, state):
-  """Which worlds come about depends on it, and not on the weights that are trained."""
+def test_the_target_network_acts(iteration, state):
+  """The next worlds depend on the target parameters, not on the trained ones."""
 
   def worlds(**learner: Any) -> list[bytes]:
     moved = state.replace(learner=state.learner.replace(**learner))
@@ -181,7 +179,7 @@ def _save(run: Path, built: Built, *states: tuple[TrainState, bool]) -> None:
       writer.save(int(state.env_steps), resume.to_items(state, whole=whole))
 
 
-def test_a_state_that_was_saved_goes_on_bit_by_bit(built, iteration, tmp_path):
+def test_a_saved_state_continues_bit_for_bit(built, iteration, tmp_path):
   _save(tmp_path, built, (built.state, True))
   example = jax.eval_shape(lambda: jax.tree.map(jnp.copy, built.state))
   restored = resume.restore(built.config, tmp_path, example, pytest.fail)
@@ -190,24 +188,24 @@ def test_a_state_that_was_saved_goes_on_bit_by_bit(built, iteration, tmp_path):
   assert all(x.committed for x in jax.tree.leaves(restored))
   assert _bits(restored) == _bits(straight) and len(_bits(straight)) > 60
   for _ in range(2):
-    straight, told = iteration(straight)
+    straight, metrics = iteration(straight)
     restored, again = iteration(restored)
-  assert _bits(restored) == _bits(straight) and _bits(told) == _bits(again)
+  assert _bits(restored) == _bits(straight) and _bits(metrics) == _bits(again)
 
 
-def test_without_its_replay_a_state_goes_on_with_an_older_one(
+def test_a_state_saved_without_replay_continues_with_an_older_one(
   built, iteration, tmp_path
 ):
   before, after = built.state, iteration(built.state)[0]
   _save(tmp_path, built, (before, True), (after, False))
   assert checkpoint_reader.all_steps(tmp_path) == [24, 32]
   example = jax.eval_shape(lambda: jax.tree.map(jnp.copy, after))
-  said: list[str] = []
-  restored = resume.restore(built.config, tmp_path, example, said.append)
-  assert said == ["its replay is that of step 24"]
+  warnings: list[str] = []
+  restored = resume.restore(built.config, tmp_path, example, warnings.append)
+  assert warnings == ["its replay is that of step 24"]
   assert _bits(restored.replace(replay=None)) == _bits(after.replace(replay=None))
   assert int(restored.replay.cursor) == int(before.replay.cursor)
-  # What is added next does not follow on the newest instant, which is now an end.
+  # The next slots do not continue the newest one, which is now marked as an end.
   held, kept = (x.replay.slots.timestep.truncated for x in (restored, before))
   newest = int(before.replay.cursor) - 1
   assert held[newest].all() and not kept[newest].any()
@@ -219,7 +217,7 @@ def test_without_its_replay_a_state_goes_on_with_an_older_one(
   ("field", "value"),
   [("qpos", np.nan), ("qvel", np.inf), ("qvel", 1e12), ("qacc_warmstart", np.nan)],
 )
-def test_a_broken_world_starts_again_and_its_episode_is_never_drawn(
+def test_a_broken_world_restarts_and_its_episode_is_never_drawn(
   built, iteration, state, field, value
 ):
   after, metrics = iteration(_break_world(state, field, value))
@@ -229,7 +227,7 @@ def test_a_broken_world_starts_again_and_its_episode_is_never_drawn(
   assert after.env.elapsed[1] < LENGTH
   for leaf in jax.tree.leaves((after.env.physics, after.learner)):
     assert jnp.isfinite(leaf).all()
-  # The instants of its episode, 3 iterations and this one, are all marked as ends.
+  # All slots of its episode, from 3 iterations and this one, are marked as ends.
   cursor, length = int(after.replay.cursor), after.replay.slots.action.shape[0]
   newest = (cursor - 1 - np.arange(4 * LENGTH)) % length
   truncated = np.asarray(after.replay.slots.timestep.truncated)
@@ -246,14 +244,14 @@ def test_a_broken_world_starts_again_and_its_episode_is_never_drawn(
     drawn = jax.tree.leaves((batch.observation_tm1, batch.observation_t))
     assert all(jnp.isfinite(x).all() for x in drawn)
     robot = np.asarray(after.replay.slots.timestep.observation.robot)[newest, 1]
-    # With an LSTM a start is a window of instants.
+    # With an LSTM a start is a window of time steps.
     starts = np.asarray(batch.observation_tm1.robot)[batch.weight > 0]
     starts = starts.reshape(-1, robot.shape[-1])
     assert not (starts[:, None, :] == robot[None]).all(-1).any()
 
 
 def test_a_world_that_breaks_in_its_first_period_is_found(built, iteration, state):
-  """C MuJoCo starts such a world over; its clock must not look like a first period."""
+  """C MuJoCo resets such a world; its clock must not pass for a first period."""
   fresh = built.env.reset(jnp.arange(WORLDS))
   poisoned = _break_world(state.replace(env=fresh), "qvel", 1e12)
   after, metrics = iteration(poisoned)
@@ -261,10 +259,10 @@ def test_a_world_that_breaks_in_its_first_period_is_found(built, iteration, stat
   np.testing.assert_array_equal(after.env.faults, [0, 1, 0, 0])
 
 
-def test_the_native_engine_alone_would_not_have_told(built, state):
-  """C MuJoCo goes on from its default pose, finite; an action it takes for none."""
+def test_the_native_engine_alone_hides_faults(built, state):
+  """C MuJoCo continues from its default pose, finite, and ignores a NaN action."""
   if built.env.physics.name != "native":
-    pytest.skip("MJX goes on with what is not a number")
+    pytest.skip("MJX continues with NaN")
   step, sound = built.env.physics.step, built.env._sound
   action = jnp.zeros((WORLDS, 7))
   broken = _break_world(state, "qpos", np.nan).env
@@ -279,12 +277,12 @@ def test_the_native_engine_alone_would_not_have_told(built, state):
 
 
 @pytest.mark.parametrize("poison", [_poison_replay, _poison_learner])
-def test_an_update_that_is_not_finite_is_skipped_and_counted(iteration, state, poison):
+def test_a_non_finite_update_is_skipped_and_counted(iteration, state, poison):
   poisoned = poison(state)
   after, metrics = iteration(poisoned)
   assert metrics["faults/updates"] == metrics["faults/updates_in_a_row"] == 2
   assert _bits(after.learner) == _bits(poisoned.learner)
-  assert jnp.isnan(metrics["loss/q"])  # There was no update whose loss it could be.
+  assert jnp.isnan(metrics["loss/q"])  # No update, so no loss.
   healed, metrics = iteration(
     after.replace(
       replay=state.replay, expert_replay=state.expert_replay, learner=state.learner
@@ -295,7 +293,7 @@ def test_an_update_that_is_not_finite_is_skipped_and_counted(iteration, state, p
   assert jnp.isfinite(metrics["loss/q"])
 
 
-def test_after_several_the_run_stops_and_the_update_can_be_repeated(
+def test_after_several_skipped_updates_the_run_stops_and_they_can_be_repeated(
   built, iteration, state, tmp_path: Path, capsys
 ):
   folder = run_folder.create(tmp_path / "run", built.config)
@@ -306,17 +304,17 @@ def test_after_several_the_run_stops_and_the_update_can_be_repeated(
     faults.check(built.config, after, folder)
   assert stop.value.code == errors.FAILED
   (file,) = folder.faults.iterdir()
-  # The message ends with a command line that works as it stands.
+  # The message ends with a command that works verbatim.
   command = str(stop.value).rpartition("apnpql ")[2].split()
   capsys.readouterr()
   assert main.main(command) == 0
-  told = capsys.readouterr().out.splitlines()
-  assert [line.split()[0] for line in told if "reward_t" in line] == ["batch"]
-  # With rewards of zero, those of windows too, the very same update is finite.
+  lines = capsys.readouterr().out.splitlines()
+  assert [line.split()[0] for line in lines if "reward_t" in line] == ["batch"]
+  # With zero rewards, also in windows, the same update is finite.
   arrays: dict[str, Any] = dict(np.load(file, allow_pickle=False))
   zeros = {k: np.zeros_like(x) for k, x in arrays.items() if "/reward" in k}
   np.savez(file, **(arrays | zeros))
   assert not any(faults.repeat(file).values())
   np.savez(file, **{k: v for k, v in arrays.items() if k != "key"})
-  with pytest.raises(UserError, match="no update of this run: 'key'"):
+  with pytest.raises(UserError, match="not an update of this run: 'key'"):
     faults.repeat(file)

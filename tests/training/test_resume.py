@@ -1,7 +1,7 @@
-"""A run that is killed, stopped and resumed is the run it would have been.
+"""A run that is killed, stopped and resumed ends like an undisturbed one.
 
-Real processes on the native engine, which are expensive to start: each proves several
-promises. What they found is in ``docs/reliability.md``.
+Uses real processes on the native engine. They are expensive to start, so each checks
+several promises. ``docs/reliability.md`` reports the results.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ FOR_EVER = ("--total-steps", "100000")
 
 
 def _wait(process: subprocess.Popen[bytes], said: Path, word: str = "%)") -> None:
-  """Until a process just started says ``word``, or that an iteration is done."""
+  """Waits until a new process prints ``word``; by default, an iteration is done."""
   before, deadline = said.read_text().count(word), time.monotonic() + PATIENCE_S
   while said.read_text().count(word) == before:
     assert process.poll() is None and time.monotonic() < deadline, said.read_text()
@@ -38,22 +38,22 @@ def _finish(process: subprocess.Popen[bytes], said: Path) -> None:
 @pytest.mark.parametrize(
   "kills", [2, pytest.param(20, marks=pytest.mark.slow, id="20")]
 )
-def test_a_run_killed_at_random_moments_ends_as_if_nothing_had_been(tmp_path, kills):
+def test_a_run_killed_at_random_times_ends_like_an_undisturbed_one(tmp_path, kills):
   rng, said, run = np.random.default_rng(kills), tmp_path / "said", tmp_path / "run"
   demos, same = tmp_path / "demos.npz", tmp_path / "same.npz"
   for path in (demos, same):
     testing.write_demonstrations(path)
 
-  # While the iteration is being compiled there is nothing to wait for.
+  # During compilation there is nothing to save, so a signal ends the process at once.
   process = testing.start(
     run, *FOR_EVER, "--replay.demonstrations", str(demos), said=said
   )
   _wait(process, said, "compiling")
   process.send_signal(signal.SIGINT)
   assert process.wait(30) == 128 + signal.SIGINT
-  *_, told, last = said.read_text().splitlines()
-  assert "compiling" in told and last.startswith("apnpql: stopped before the first")
-  assert f"16 instants of {demos} for 32 slots" in said.read_text()
+  *_, before, last = said.read_text().splitlines()
+  assert "compiling" in before and last.startswith("apnpql: stopped before the first")
+  assert f"16 time steps of {demos} for 32 slots" in said.read_text()
 
   lost, saving = [], 0
   for _ in range(kills):
@@ -69,9 +69,9 @@ def test_a_run_killed_at_random_moments_ends_as_if_nothing_had_been(tmp_path, ki
     lost.append(reached - saved)
     saving += any((run / "checkpoints").glob("*tmp*"))
     print(f"lost {lost[-1]} of {reached}", flush=True)
-    if saved:  # From the first checkpoint on nobody needs the file.
+    if saved:  # The file is not needed after the first checkpoint.
       demos.unlink(missing_ok=True)
-  # An interval, and what is trained while a checkpoint is being written.
+  # At most an interval and the steps trained while a checkpoint is being written.
   assert max(lost) <= 2 * testing.TINY.checkpoint_every
   print(f"{kills} kills, {saving} while saving; environment steps lost: {lost}")
 
@@ -80,9 +80,9 @@ def test_a_run_killed_at_random_moments_ends_as_if_nothing_had_been(tmp_path, ki
   process.terminate()
   assert process.wait(PATIENCE_S) == 128 + signal.SIGTERM
   stopped = checkpoint_reader.latest_step(run)
-  assert f"saved at step {stopped:,}; to go on: --resume {run}" in said.read_text()
+  assert f"saved at step {stopped:,}; to continue: --resume {run}" in said.read_text()
 
-  # Evaluations are none of the training's business.
+  # Evaluations must not affect training.
   total = str(testing.rows(run)[-1]["step"] + 16 * testing.STEPS)
   other = ["--total-steps", total, "--eval-episodes", "2"]
   other += ["--replay.demonstrations", str(same)]
@@ -95,14 +95,14 @@ def test_a_run_killed_at_random_moments_ends_as_if_nothing_had_been(tmp_path, ki
     _finish(process, said)
   bits = testing.saved_bytes(run, int(total))
   assert bits == testing.saved_bytes(straight, int(total)) and len(bits) > 50
-  # Each iteration stands once in the metrics, with the same figures.
+  # Each iteration is in the metrics once, with the same numbers.
   losses = [
     [(row["step"], row["loss/q"]) for row in testing.rows(folder) if "loss/q" in row]
     for folder in (run, straight)
   ]
   assert losses[0] == losses[1] and len(losses[0]) == int(total) // testing.STEPS
-  # What the processes before compiled is not compiled again, and after the first
-  # iteration nothing is but the evaluation.
+  # Nothing that earlier processes compiled is compiled again, and after the first
+  # iteration nothing but the evaluation is.
   compiled = log.read_text().partition(" 8 of ")[2].count("Finished XLA compilation")
   assert log.read_text().count("compilation of jit(iteration)") == 1
   assert "compilation cache hit for 'jit_iteration'" in log.read_text()
@@ -113,8 +113,8 @@ def test_a_run_killed_at_random_moments_ends_as_if_nothing_had_been(tmp_path, ki
 @pytest.mark.parametrize(
   ("backend", "obs"), [("mjx", "state"), ("native", "pixels"), ("mjx", "pixels")]
 )
-def test_a_run_resumed_in_a_new_process_is_the_run_that_was_not(backend, obs):
-  """For other engines and observations, compiled as any run is."""
+def test_a_run_resumed_in_a_new_process_equals_an_undisturbed_one(backend, obs):
+  """Covers other engines and observations, compiled like any run."""
   command = [sys.executable, str(testing.ROOT / "benchmarks" / "resume.py")]
   command += ["--backend", backend, "--obs", obs]
   env = os.environ | {"PYTHONPATH": str(testing.ROOT)}

@@ -1,7 +1,7 @@
 """Several devices, and several processes, learn what one device learns.
 
-They add up in another order than one device does. Nothing else may differ: how far
-the parameters are apart is held to be small against the way that they have come.
+Only the order of their sums may differ, so the distance between the parameters must be
+small compared to how far they moved.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ from apnpql_jax.training.state import TrainState, example_state, initial_state
 DEVICES = 4
 ITERATIONS = 3
 LENGTH = 26
-"""Time steps of the replay: of the sizes in the program, only it has this one."""
+"""Time steps of the replay; no other size in the program has this value."""
 
 ROUNDING = 1e-4
-"""Of the way that the parameters have come; measured: 1e-6."""
+"""Allowed distance as a fraction of how far the parameters moved; measured: 1e-6."""
 
 PATIENCE_S = 600
 
@@ -58,53 +58,54 @@ def test_four_devices_learn_what_one_learns(backend):
   flags = f"{testing.XLA_FLAGS} --xla_force_host_platform_device_count={DEVICES}"
   path = os.pathsep.join(map(str, (testing.ROOT, *sys.path, Path(__file__).parent)))
   done = subprocess.run(
-    [sys.executable, "-c", f"import test_sharding as t; t.tell({backend!r})"],
+    [sys.executable, "-c", f"import test_sharding as t; t.compare({backend!r})"],
     env=os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": path},
     stdout=subprocess.PIPE,
     timeout=PATIENCE_S,
     check=True,
   )
-  told = json.loads(done.stdout)
-  print(told)
-  assert told["loss"][0] == pytest.approx(told["loss"][1], rel=1e-4)
-  assert told["distance"] < ROUNDING * told["way"]
+  result = json.loads(done.stdout)
+  print(result)
+  assert result["loss"][0] == pytest.approx(result["loss"][1], rel=1e-4)
+  assert result["distance"] < ROUNDING * result["moved"]
   # Each device has a part of the worlds and of both replays, and all of the rest.
-  assert told["split"] == ["env", "expert_replay/slots", "replay/slots"]
-  # What travels is a batch or gradients, never a replay; and while worlds are played,
-  # nothing.
-  assert told["messages"] and not any(f"[{LENGTH}," in m for m in told["messages"])
-  assert told["messages_of_rollout"] == []
-  assert told["resumed_on_four"] and told["resumed_on_one"]
+  assert result["split"] == ["env", "expert_replay/slots", "replay/slots"]
+  # Messages hold a batch or gradients, never a replay. Rollouts send none.
+  assert result["messages"] and not any(f"[{LENGTH}," in m for m in result["messages"])
+  assert result["messages_of_rollout"] == []
+  assert result["resumed_on_four"] and result["resumed_on_one"]
 
 
-def tell(backend: str) -> None:
-  """Prints what becomes of a run on one device and on several, as JSON."""
+def compare(backend: str) -> None:
+  """Prints the results of a run on one device and on several as JSON."""
   env = dataclasses.replace(testing.TINY.env, backend=backend, worlds=2 * DEVICES)
   replay = dataclasses.replace(testing.TINY.replay, capacity=LENGTH * env.worlds)
   config = dataclasses.replace(testing.TINY, env=env, replay=replay)
-  told: dict[str, Any] = {"loss": []}
+  result: dict[str, Any] = {"loss": []}
   several = make_env(config.env, devices.make_mesh(DEVICES))
   alone, agent, ends = several.on_one_device(), make_agent(config.agent), []
   begin = initial_state(config, alone, agent, collect_expert)
   for env in (alone, several):
-    copy = jax.tree.map(jnp.copy, begin)  # The iteration takes the state for itself.
+    copy = jax.tree.map(jnp.copy, begin)  # The iteration donates its argument.
     state = jax.device_put(copy, shardings(copy, env.mesh))
     jitted: Any = make_iteration(config, env, agent)
     iteration = jitted.lower(state).compile()
     for _ in range(ITERATIONS):
       state, metrics = iteration(state)
-    told["loss"].append(float(metrics["loss/q"]))
+    result["loss"].append(float(metrics["loss/q"]))
     ends.append(_flat(state.learner))
-  told["distance"] = float(np.linalg.norm(ends[1] - ends[0]))
-  told["way"] = float(np.linalg.norm(ends[0] - _flat(begin.learner)))
-  told["split"] = _split(state)
-  told["messages"] = messages.messages(iteration)
+  result["distance"] = float(np.linalg.norm(ends[1] - ends[0]))
+  result["moved"] = float(np.linalg.norm(ends[0] - _flat(begin.learner)))
+  result["split"] = _split(state)
+  result["messages"] = messages.messages(iteration)
 
   def play(state: TrainState) -> Any:
     policy = agent_policy(agent, state.learner.params, greedy=False)
     return rollout(several, policy, state.env, state.key, length=2)
 
-  told["messages_of_rollout"] = messages.messages(jax.jit(play).lower(state).compile())
+  result["messages_of_rollout"] = messages.messages(
+    jax.jit(play).lower(state).compile()
+  )
   with tempfile.TemporaryDirectory() as name:
     run = Path(name)
     with CheckpointWriter(run, config, keep=1) as writer:
@@ -113,10 +114,10 @@ def tell(backend: str) -> None:
       example = example_state(config, place, agent)
       found = resume.restore(config, run, example, print)
       same = leaves.checksums(found) == leaves.checksums(state)
-      told[f"resumed_on_{key}"] = same and jax.tree.map(
+      result[f"resumed_on_{key}"] = same and jax.tree.map(
         lambda x: x.sharding, found
       ) == jax.tree.map(lambda x: x.sharding, example)
-  print(json.dumps(told))
+  print(json.dumps(result))
 
 
 def _flat(learner: LearnerState) -> np.ndarray:
@@ -124,7 +125,7 @@ def _flat(learner: LearnerState) -> np.ndarray:
 
 
 def _split(state: TrainState) -> list[str]:
-  """Which parts are split evenly; all leaves of a part must be."""
+  """Returns the parts that are split evenly; all leaves of a part must be."""
   parts: dict[str, set[bool]] = {}
   for name, leaf in leaves.named(state).items():
     sizes = [shard.data.size for shard in leaf.addressable_shards]
@@ -136,7 +137,7 @@ def _split(state: TrainState) -> list[str]:
 
 def test_two_processes_learn_what_one_learns_and_stop_together(tmp_path):
   run, single = tmp_path / "run", tmp_path / "single"
-  said = [tmp_path / "first", tmp_path / "second", tmp_path / "single.log"]
+  logs = [tmp_path / "first", tmp_path / "second", tmp_path / "single.log"]
 
   def start(*args: str) -> list[subprocess.Popen[bytes]]:
     with socket.socket() as free:
@@ -145,24 +146,24 @@ def test_two_processes_learn_what_one_learns_and_stop_together(tmp_path):
     shared = ("--coordinator", address, "--processes", "2", "--process")
     common = ("--keep-checkpoints", "1000", *args)
     return [
-      testing.start(run, *common, *shared, str(i), said=said[i]) for i in range(2)
+      testing.start(run, *common, *shared, str(i), said=logs[i]) for i in range(2)
     ]
 
   pair = start("--total-steps", "32")
-  alone = testing.start(single, "--total-steps", "64", said=said[2])
-  for process, log in zip([*pair, alone], said, strict=True):
+  alone = testing.start(single, "--total-steps", "64", said=logs[2])
+  for process, log in zip([*pair, alone], logs, strict=True):
     assert process.wait(PATIENCE_S) == 0, log.read_text()[-4000:]
-  # The first process tells of it, the second one has nothing to say.
-  assert "32 of 32" in said[0].read_text()
-  assert "step" not in said[1].read_text()
+  # Only the first process prints.
+  assert "32 of 32" in logs[0].read_text()
+  assert "step" not in logs[1].read_text()
 
   pair = start("--total-steps", "1000000")
   deadline = time.monotonic() + PATIENCE_S
   while 64 not in checkpoint_reader.all_steps(run):
-    assert time.monotonic() < deadline and pair[0].poll() is None, said[0].read_text()
+    assert time.monotonic() < deadline and pair[0].poll() is None, logs[0].read_text()
     time.sleep(0.1)
   pair[1].send_signal(signal.SIGTERM)
-  for process, log in zip(pair, said, strict=False):
+  for process, log in zip(pair, logs, strict=False):
     assert process.wait(PATIENCE_S) == 128 + signal.SIGTERM, log.read_text()[-4000:]
   rows = [row["step"] for row in testing.rows(run) if "loss/q" in row]
   assert rows == list(range(8, rows[-1] + 8, 8))
@@ -172,7 +173,7 @@ def test_two_processes_learn_what_one_learns_and_stop_together(tmp_path):
 
 
 def assert_same(run: Path, single: Path) -> None:
-  """Both runs have the same parameters after 64 steps, within rounding."""
+  """Asserts that both runs have the same parameters after 64 steps, within rounding."""
   config = run_folder.load_run_config(run)
   env, agent = make_env(config.env), make_agent(config.agent)
   example = {"learner": example_state(config, env, agent).learner}
@@ -181,16 +182,16 @@ def assert_same(run: Path, single: Path) -> None:
     return _flat(checkpoint_reader.restore(folder, step, example).items["learner"])
 
   end = saved(single, 64)
-  way, distance = (np.linalg.norm(end - saved(run, step)) for step in (16, 64))
-  print(f"distance {distance:.3g}, way {way:.3g}")
-  assert 0 < distance < ROUNDING * way
+  moved, distance = (np.linalg.norm(end - saved(run, step)) for step in (16, 64))
+  print(f"distance {distance:.3g}, moved {moved:.3g}")
+  assert 0 < distance < ROUNDING * moved
 
 
 @pytest.mark.parametrize(
   ("devices", "message"),
   [(3, "env.worlds=32 must be a multiple of the 3 devices"), (64, "env.worlds=32")],
 )
-def test_what_cannot_be_split_is_refused(devices, message):
+def test_uneven_splits_are_rejected(devices, message):
   with pytest.raises(UserError, match=re.escape(message)):
     validate(TrainConfig(), devices=devices)
 
@@ -203,6 +204,6 @@ def test_what_cannot_be_split_is_refused(devices, message):
     (["--processes", "2"], "--processes and --process need a --coordinator"),
   ],
 )
-def test_bad_options_are_refused_in_one_line(options, message, capsys):
+def test_bad_options_are_rejected_in_one_line(options, message, capsys):
   assert main.main(["train", "push_plate", *options]) == 2
   assert message in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""A whole run, small but real: train, resume, evaluate, stop by a signal."""
+"""A small but complete run: train, resume, evaluate, stop by a signal."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ CONFIG = TrainConfig(
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory) -> tuple[Path, dict]:
-  """A run to its end, and what ``train`` returned."""
+  """Returns the folder of a finished run and the result of ``train``."""
   run_dir = tmp_path_factory.mktemp("runs") / "run"
   return run_dir, train(CONFIG, run_dir, resume=False)
 
 
-def test_a_run_leaves_everything_behind(finished):
+def test_a_run_writes_all_its_files(finished):
   run_dir, summary = finished
   assert summary["env_steps"] == 64 and summary["updates"] == 8
   assert summary["episodes"] == 4
@@ -60,7 +60,7 @@ def test_a_run_leaves_everything_behind(finished):
   assert iio.imread(folder.curve).shape[-1] in (3, 4)
   (video,) = folder.videos.iterdir()
   frames = iio.imread(video)
-  # Both cameras stand beside the larger view, and something moves.
+  # Both cameras are next to the larger view, and something moves.
   assert frames.shape[0] > 10 and frames.shape[2] > 1.5 * frames.shape[1]
   assert np.abs(frames[0].astype(int) - frames[8]).max() > 50
 
@@ -71,7 +71,7 @@ def test_evaluate_reports_the_newest_checkpoint(finished, tmp_path):
   figures = evaluate(run_dir, episodes=4, seed=3, greedy=True, video=video)
   assert figures["checkpoint_step"] == 64
   assert figures["episodes"] == 4 and figures["greedy"]
-  # All instants of all four, the last of each held.
+  # All time steps of all four, the last of each held.
   frames = len(iio.imread(next(video.parent.iterdir())))
   assert frames == 4 * (figures["mean_length"] + HOLD)
   assert figures["backend"] == "native" and figures["algorithm"] == "ap_npql"
@@ -79,7 +79,7 @@ def test_evaluate_reports_the_newest_checkpoint(finished, tmp_path):
   assert 0 <= low <= figures["success_rate"] <= high <= 1
 
 
-def test_resume_goes_on(finished):
+def test_resume_continues_the_run(finished):
   run_dir, _ = finished
   longer = dataclasses.replace(CONFIG, total_steps=96, video=False)
   summary = train(longer, run_dir, resume=True)
@@ -89,7 +89,7 @@ def test_resume_goes_on(finished):
   assert steps == [16, 32, 48, 64, 80, 96]
 
 
-def test_resume_refuses_other_settings(finished):
+def test_resume_rejects_other_settings(finished):
   run_dir, _ = finished
   other = dataclasses.replace(
     CONFIG, agent=dataclasses.replace(CONFIG.agent, gamma=0.9)
@@ -105,8 +105,8 @@ def test_ctrl_c_ends_the_run_with_a_checkpoint(tmp_path):
   command += "--replay.capacity 512 --replay.expert-steps 128".split()
   command += "--total-steps 1000000 --eval-every 1000000".split()
   command += "--checkpoint-every 1000000".split()
-  said = tmp_path / "said.txt"
-  with said.open("w") as file:
+  log = tmp_path / "log.txt"
+  with log.open("w") as file:
     process = subprocess.Popen([*command, "--run", str(run_dir)], stderr=file)
   try:
     metrics = run_dir / "metrics.jsonl"
@@ -121,4 +121,4 @@ def test_ctrl_c_ends_the_run_with_a_checkpoint(tmp_path):
   (step,) = checkpoint_reader.all_steps(run_dir)
   rows = [json.loads(line) for line in metrics.read_text().splitlines()]
   assert rows[-1]["step"] == step
-  assert f"saved at step {step}; to go on: --resume {run_dir}" in said.read_text()
+  assert f"saved at step {step}; to continue: --resume {run_dir}" in log.read_text()
