@@ -1,7 +1,7 @@
-"""Reads checkpoints back: the newest that is whole and belongs to the run.
+"""Checkpoint reading: the newest one that is intact and belongs to the run.
 
-Items of a checkpoint are read one by one: who only plays needs the learner alone. What
-makes one trustworthy is its record, see ``checkpoint_record``.
+Items of a checkpoint are read one by one, because an evaluation needs the learner
+alone. Each is verified against the record of the checkpoint, see ``checkpoint_record``.
 """
 
 from __future__ import annotations
@@ -28,40 +28,43 @@ all_steps = checkpoint_record.steps
 
 
 class Restored(NamedTuple):
-  """What ``restore`` found."""
+  """Result of ``restore``."""
 
   step: int
   items: dict[str, Any]
-  """Item -> pytree, as asked for."""
+  """Item -> pytree, as requested."""
 
   steps: dict[str, int]
-  """Item -> step of the checkpoint that held it: ``step`` or an earlier one."""
+  """Item -> step of the checkpoint that holds it: ``step`` or an earlier one."""
 
   damaged: list[str]
-  """One line for every newer checkpoint that could not be used."""
+  """One line for each newer checkpoint that could not be used."""
 
 
 def latest_step(run_dir: Path) -> int | None:
-  """Step of the newest complete checkpoint; None if there is none."""
+  """Returns the step of the newest complete checkpoint; None if there is none."""
   return max(all_steps(run_dir), default=None)
 
 
 def best_step(run_dir: Path) -> int | None:
-  """Step of highest success rate, the newest of equals; None if none was evaluated."""
+  """Returns the step with the highest success rate; None if none was evaluated.
+
+  Of equal rates the newest wins.
+  """
   records = checkpoint_record.read_all(run_dir)
   return best({step: record.success_rate for step, record in records.items()})
 
 
 def check(run_dir: Path, step: int | None, *, config: TrainConfig | None = None) -> int:
-  """Refuses checkpoints that cannot be restored, before anything else is built.
+  """Rejects checkpoints that cannot be restored, before anything else is built.
 
   Args:
     run_dir: the run folder.
-    step: the newest whose record can be read, if None.
-    config: as of ``restore``.
+    step: the checkpoint; None selects the newest one with a readable record.
+    config: as in ``restore``.
 
   Returns:
-    the step.
+    The step.
 
   Raises:
     FileError: there is no such checkpoint, or it belongs to another configuration
@@ -88,21 +91,22 @@ def restore(
   *,
   config: TrainConfig | None = None,
 ) -> Restored:
-  """Reads items of a checkpoint back, bit by bit as they were saved.
+  """Restores items of a checkpoint with the exact bits that were saved.
 
-  An item that the checkpoint lacks is taken from the newest earlier one that has it.
+  An item that the checkpoint lacks comes from the newest earlier one that holds it.
 
   Args:
     run_dir: the run folder.
-    step: the newest that can be read if None; of no other is any taken instead.
-    examples: item -> the same pytree, with arrays or ShapeDtypeStructs. The latter,
-      as from ``jax.eval_shape``, spare the memory of a second state.
-    config: if given, what the checkpoint must have been made with, apart from the
+    step: the checkpoint, without fallback; None selects the newest readable one.
+    examples: item -> a pytree of the same structure, with arrays or
+      ShapeDtypeStructs. The latter, as from ``jax.eval_shape``, save the memory of a
+      second state.
+    config: if given, the configuration that the checkpoint must have, except for
       settings that a resumed run may change.
 
   Raises:
     FileError: there is no such checkpoint, it belongs to another configuration or
-      format, it holds other leaves than the example, or its files cannot be read.
+      format, its leaves differ from the example, or its files cannot be read.
   """
   damaged: list[str] = []
   for candidate in _candidates(run_dir, step):
@@ -120,7 +124,7 @@ def restore(
 
 
 def _candidates(run_dir: Path, step: int | None) -> list[int]:
-  """The step asked for, or all, newest first."""
+  """Returns the requested step, or all steps, newest first."""
   steps = all_steps(run_dir)
   if not steps:
     raise FileError(f"{str(run_dir)!r} has no checkpoint")
@@ -162,9 +166,9 @@ def _restore_item(run_dir: Path, step: int, item: str, example: Any) -> Any:
       path = checkpoint_record.folder(run_dir) / str(step) / item
       tree = reader.restore(path, leaves.abstract(example))
   except (MemoryError, PermissionError):
-    raise  # No fault of the checkpoint's.
-  except Exception as error:  # Whatever Orbax or the file system found wrong.
-    # Pages of it would come from each of its tasks for which nobody waits any more.
+    raise  # Not caused by the checkpoint.
+  except Exception as error:  # Any error of Orbax or the file system.
+    # Orbax's abandoned tasks would log pages of tracebacks.
     logging.getLogger("asyncio").setLevel(logging.CRITICAL)
     raise DamagedError(f"{name} cannot be read: {one_line(error)}") from error
   checkpoint_record.check_bits(name, saved, tree)

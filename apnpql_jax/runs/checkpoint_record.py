@@ -1,9 +1,8 @@
-"""What every checkpoint says of itself: settings, success rate, and each leaf.
+"""Record of a checkpoint: its configuration, success rate and leaves.
 
-Read before the arrays are, so that a checkpoint that is wrong, damaged or too large is
-refused by name before memory is taken for it. Orbax itself would cast a leaf of another
-dtype without a word and does not notice a flipped bit; hence the checksums, of the
-leaves and of the record.
+The record is read before the arrays, so that a wrong, damaged or oversized checkpoint
+is rejected before memory is allocated for it. It holds checksums of the leaves and of
+itself, because Orbax silently casts a leaf of another dtype and misses flipped bits.
 """
 
 from __future__ import annotations
@@ -20,14 +19,14 @@ from apnpql_jax.errors import FileError, UserError, one_line
 from apnpql_jax.runs import leaves, text
 
 SCHEMA_VERSION = 2
-"""Raised whenever what the code expects in a checkpoint changes."""
+"""Version of the format; incremented whenever the format changes."""
 
 _MAX_BYTES = 16 << 20
-"""A record has some hundred bytes per leaf; a longer file is none of ours."""
+"""Limit for the file of a record, which takes a few hundred bytes per leaf."""
 
 
 class DamagedError(FileError):
-  """A checkpoint that is not as it was written; an older one may be."""
+  """A checkpoint that differs from what was written; an older one may be intact."""
 
 
 class Leaf(NamedTuple):
@@ -37,14 +36,14 @@ class Leaf(NamedTuple):
   """dtype and shape, such as ``uint8[4, 72, 96, 3]``."""
 
   key_impl: str | None
-  """Name of its generator, if it is a typed PRNG key."""
+  """Name of the generator if the leaf is a typed PRNG key."""
 
   crc32: int
-  """Of its bytes."""
+  """Checksum of the bytes."""
 
 
 class Record(NamedTuple):
-  """What ``describe`` wrote and ``read`` verified."""
+  """Content that ``describe`` wrote and ``read`` verified."""
 
   config: dict[str, Any]
   success_rate: float | None
@@ -55,7 +54,7 @@ class Record(NamedTuple):
 def describe(
   config: TrainConfig, items: Mapping[str, Any], success_rate: float | None
 ) -> dict[str, Any]:
-  """The record of a checkpoint of ``items`` (name -> pytree), as JSON can hold it."""
+  """Returns the record for a checkpoint of ``items`` (name -> pytree) as JSON data."""
   record = {
     "schema_version": SCHEMA_VERSION,
     "config": json.loads(config_to_json(config)),
@@ -66,11 +65,11 @@ def describe(
 
 
 def read(run_dir: Path, step: int) -> Record:
-  """The record of a checkpoint.
+  """Returns the record of a checkpoint.
 
   Raises:
-    DamagedError: it is not there or not as it was written.
-    FileError: it has another format.
+    DamagedError: the record is missing or differs from what was written.
+    FileError: the record has another format.
   """
   path = folder(run_dir) / str(step) / "meta" / "metadata"
   name = title(run_dir, step)
@@ -104,46 +103,46 @@ def read(run_dir: Path, step: int) -> Record:
 
 
 def read_all(run_dir: Path) -> dict[int, Record]:
-  """Step -> record of every checkpoint of a run that can be read, ascending."""
+  """Returns step -> record, ascending, of each readable checkpoint of a run."""
   records = {}
   for step in steps(run_dir):
     try:
       records[step] = read(run_dir, step)
-    except UserError:  # Named where somebody asks for it.
+    except UserError:  # Reported when this checkpoint is requested.
       continue
   return records
 
 
 def steps(run_dir: Path) -> list[int]:
-  """Steps of the complete checkpoints of a run, ascending."""
+  """Returns the steps of the complete checkpoints of a run, ascending."""
   from orbax.checkpoint import utils
 
   return sorted(utils.checkpoint_steps(folder(run_dir)))
 
 
 def folder(run_dir: Path) -> Path:
-  """Where the checkpoints of a run lie."""
+  """Returns the folder of the checkpoints of a run."""
   return run_dir.absolute() / "checkpoints"
 
 
 def title(run_dir: Path, step: int) -> str:
-  """How messages name a checkpoint."""
+  """Returns the name of a checkpoint for messages."""
   return f"checkpoint {step} of {str(run_dir)!r}"
 
 
 def best(rates: Mapping[int, float | None]) -> int | None:
-  """Step of the highest rate, the newest of equals; None if there is none."""
+  """Returns the newest step with the highest rate; None if there is no rate."""
   known = {step: rate for step, rate in rates.items() if rate is not None}
   return max(known, key=lambda step: (known[step], step), default=None)
 
 
 def newest_until(last: int, steps: Iterable[int]) -> int | None:
-  """The largest of ``steps`` up to ``last``; None if there is none."""
+  """Returns the largest of ``steps`` up to ``last``; None if there is none."""
   return max((step for step in steps if step <= last), default=None)
 
 
 def check_kinds(name: str, saved: Mapping[str, Leaf], example: Any) -> None:
-  """Refuses leaves of another name, dtype or shape than those of ``example``.
+  """Rejects leaves whose name, dtype or shape differs from those of ``example``.
 
   Raises:
     FileError: names the first leaf that differs.
@@ -157,7 +156,7 @@ def check_kinds(name: str, saved: Mapping[str, Leaf], example: Any) -> None:
 
 
 def check_bits(name: str, saved: Mapping[str, Leaf], tree: Any) -> None:
-  """Compares what was read with what was saved.
+  """Compares the leaves that were read with the saved checksums.
 
   Raises:
     DamagedError: names the first leaf that differs.

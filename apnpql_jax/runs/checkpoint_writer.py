@@ -1,12 +1,12 @@
-"""Writes the checkpoints of a run in the background, with Orbax, and sorts them out.
+"""Checkpoint writing in the background, with Orbax.
 
-A checkpoint consists of named items, so that the replay, by far the largest, may be
+A checkpoint consists of named items, so that the replay, by far the largest, can be
 saved less often than the rest.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 import shutil
 import time
@@ -18,42 +18,35 @@ from apnpql_jax.runs import checkpoint_record, leaves
 from apnpql_jax.runs.checkpoint_record import best, newest_until
 
 _CHUNK_BYTES = 16 << 20
-"""Unit of compression: a replay as one chunk took one core twice as long."""
+"""Unit of compression; a replay in one chunk kept a core busy twice as long."""
 
 
 class SaveError(OSError):
-  """A checkpoint could not be written; those before it are as they were."""
+  """A failed save; earlier checkpoints are unchanged."""
 
 
 class CheckpointWriter:
-  """Saves the checkpoints of one run and deletes those no longer wanted.
+  """Saves the checkpoints of one run and deletes those that are no longer needed.
 
-  Use as a context manager: leaving it waits until the last save is on disk, unless that
-  has failed. A checkpoint becomes visible only once it is complete.
+  Use as a context manager: leaving it waits until the last save is on disk, unless a
+  save has failed. A checkpoint becomes visible only once it is complete.
   """
 
-  def __init__(
-    self,
-    run_dir: Path,
-    config: TrainConfig,
-    *,
-    keep: int,
-    keep_best: bool = True,
-  ):
+  def __init__(self, run_dir: Path, config: TrainConfig, *, keep: int):
     """Opens the run for writing.
 
     Args:
       run_dir: the run folder.
-      config: stored beside every state.
-      keep: newest checkpoints kept, with the older ones that their items lie in.
-      keep_best: keep the one of highest success rate too (the newest of equals).
+      config: stored with every checkpoint.
+      keep: number of newest checkpoints to keep, in addition to the older ones that
+        hold items they lack and the one with the highest success rate.
     """
     import orbax.checkpoint as ocp
 
     self._run_dir, self._config = run_dir, config
-    self._keep = _KeepNewestAndBest(run_dir, keep, keep_best=keep_best)
+    self._policy = _KeepNewestAndBest(run_dir, keep)
     options = ocp.CheckpointManagerOptions(
-      preservation_policy=self._keep, cleanup_tmp_directories=True
+      preservation_policy=self._policy, cleanup_tmp_directories=True
     )
     self._manager = ocp.CheckpointManager(
       checkpoint_record.folder(run_dir), options=options
@@ -62,7 +55,7 @@ class CheckpointWriter:
 
   @property
   def empty(self) -> bool:
-    """No checkpoint has been saved."""
+    """Whether the run has no checkpoint."""
     return not self._manager.all_steps()
 
   def save(
@@ -70,19 +63,19 @@ class CheckpointWriter:
   ) -> bool:
     """Starts writing ``items``; they may be donated as soon as this returns.
 
-    On a CPU, donated buffers that are still being read are replaced by new ones, so
-    that memory for a second state is needed. Waits for an earlier save first.
+    Waits for the previous save first. On a CPU, JAX replaces donated buffers that are
+    still being read, which takes memory for a second state.
 
     Args:
       step: environment steps done.
-      items: name -> pytree of arrays, typed PRNG keys included.
-      success_rate: what decides which checkpoint is best; None if not evaluated.
+      items: name -> pytree of arrays, including typed PRNG keys.
+      success_rate: decides which checkpoint is the best; None if not evaluated.
 
     Returns:
-      False if this step had been saved before; nothing is written then.
+      False, without writing, if this step has already been saved.
 
     Raises:
-      SaveError: this save could not be started, or the one before it failed.
+      SaveError: this save cannot be started, or the previous one failed.
     """
     import orbax.checkpoint as ocp
 
@@ -93,20 +86,20 @@ class CheckpointWriter:
     record = checkpoint_record.describe(self._config, items, success_rate)
     parts = {name: _save_args(leaves.to_plain(tree)) for name, tree in items.items()}
     parts["meta"] = ocp.args.JsonSave(record)
-    self._keep.note(step, success_rate, set(items))
+    self._policy.add(step, success_rate, items)
     try:
       return self._manager.save(step, args=ocp.args.Composite(**parts), force=True)
     except Exception as error:
       raise self._failed(error) from error
 
   def finished(self, *, wait: bool = False) -> dict[str, float]:
-    """Seconds and MiB of the save that has ended since the last call; else empty.
+    """Returns seconds and MiB of a save that ended since the last call, or nothing.
 
     Args:
-      wait: until a save under way has ended.
+      wait: whether to wait for a save in progress.
 
     Raises:
-      SaveError: it failed.
+      SaveError: the save failed.
     """
     if self._saving is None or not wait and self._manager.is_saving_in_progress():
       return {}
@@ -118,10 +111,10 @@ class CheckpointWriter:
     return {"checkpoint/wall_s": seconds, "checkpoint/mib": size / 2**20}
 
   def wait(self) -> None:
-    """Returns when everything saved is on disk.
+    """Waits until everything saved is on disk.
 
     Raises:
-      SaveError: it is not.
+      SaveError: a save failed.
     """
     try:
       self._manager.wait_until_finished()
@@ -130,10 +123,10 @@ class CheckpointWriter:
     self._saving = None
 
   def close(self) -> None:
-    """Waits as ``wait`` does, then lets go of the run.
+    """Waits as ``wait`` does, then releases Orbax's threads.
 
-    Not if that fails: threads of a save that failed half-way can wait for each other
-    for minutes.
+    After a failed save it leaves them alone, because they can block each other for
+    minutes.
     """
     self.wait()
     self._manager.close()
@@ -146,7 +139,7 @@ class CheckpointWriter:
       self.close()
 
   def _failed(self, error: Exception) -> SaveError:
-    """Removes what a failed save left, which may be what fills the disk."""
+    """Removes what a failed save left behind, which may fill the disk."""
     step, _ = self._saving or (None, 0.0)
     self._saving = None
     for part in checkpoint_record.folder(self._run_dir).glob(f"{step}.*-tmp*"):
@@ -155,27 +148,30 @@ class CheckpointWriter:
 
 
 class _KeepNewestAndBest:
-  """Orbax policy of what to keep; its own forget the metrics of earlier processes."""
+  """Orbax policy that keeps the newest checkpoints, the holders of their items, and the
+  best one.
 
-  def __init__(self, run_dir: Path, keep: int, *, keep_best: bool):
-    self._keep, self._keep_best = keep, keep_best
+  Orbax's own policies do not see items, and its BestN reads the rate from an item that
+  existing checkpoints lack.
+  """
+
+  def __init__(self, run_dir: Path, keep: int):
+    self._keep = keep
     self._rates: dict[int, float | None] = {}
     self._items: dict[int, set[str]] = {}
     for step, record in checkpoint_record.read_all(run_dir).items():
-      self.note(step, record.success_rate, set(record.items))
+      self.add(step, record.success_rate, record.items)
 
-  def note(self, step: int, success_rate: float | None, items: set[str]) -> None:
-    self._rates[step], self._items[step] = success_rate, items
+  def add(self, step: int, success_rate: float | None, items: Iterable[str]) -> None:
+    self._rates[step], self._items[step] = success_rate, set(items)
 
   def should_preserve(self, checkpoints: Sequence[Any], **_: Any) -> list[bool]:
     steps = sorted(info.step for info in checkpoints)
     newest = steps[-self._keep :]
-    kept = set(newest)
+    kept = {*newest, best({step: self._rates.get(step) for step in steps})}
     for name in set().union(*self._items.values()):
       holding = [step for step in steps if name in self._items.get(step, ())]
       kept |= {newest_until(step, holding) for step in newest}
-    if self._keep_best:
-      kept.add(best({step: self._rates.get(step) for step in steps}))
     return [info.step in kept for info in checkpoints]
 
 
@@ -188,6 +184,6 @@ def _save_args(plain: Any) -> Any:
 
 
 def _cause(error: Exception) -> str:
-  """What the file system said, without the names of temporary files around it."""
-  text = one_line(error)
-  return text.rpartition(": ")[2] if "os_error_code" in text else text
+  """Returns the file system's message without the names of temporary files."""
+  text = " ".join(str(error).split())
+  return text.rpartition(": ")[2] if "os_error_code" in text else one_line(error)

@@ -1,4 +1,4 @@
-"""State pytrees for storage: a name and a kind for each leaf, keys as plain arrays."""
+"""Leaves of state pytrees for storage: names, kinds, checksums, plain PRNG keys."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ import numpy as np
 from apnpql_jax import devices
 
 _SLAB_BYTES = 64 << 20
-"""What is gathered at once has to fit onto one device."""
+"""Size of the slabs that are gathered from all processes; one has to fit a device."""
 
 
 def named(tree: Any) -> dict[str, Any]:
-  """Path of each leaf -> leaf."""
+  """Returns path -> leaf."""
   leaves = jax.tree_util.tree_leaves_with_path(tree)
   return {_name(path): leaf for path, leaf in leaves}
 
 
 def fill(example: Any, arrays: Mapping[str, Any]) -> Any:
-  """The tree of ``example`` with the ``arrays`` that ``named`` gives of it.
+  """Undoes ``named``: returns a tree like ``example`` with ``arrays`` as its leaves.
 
   Raises:
-    KeyError: one is missing.
+    KeyError: an array is missing.
   """
   return jax.tree_util.tree_map_with_path(lambda p, _: arrays[_name(p)], example)
 
 
 def nbytes(tree: Any) -> int:
-  """Bytes that the leaves take on each of their devices; ShapeDtypeStructs do."""
+  """Returns the bytes that the leaves or ShapeDtypeStructs take on each device."""
 
   def size(leaf: Any) -> int:
     where = getattr(leaf, "sharding", None)
@@ -45,12 +45,12 @@ def nbytes(tree: Any) -> int:
 
 
 def describe(tree: Any) -> dict[str, str]:
-  """Path of each leaf -> dtype and shape, such as ``uint8[4, 72, 96, 3]``."""
+  """Returns path -> dtype and shape, such as ``uint8[4, 72, 96, 3]``, of each leaf."""
   return {path: f"{leaf.dtype}{list(leaf.shape)}" for path, leaf in named(tree).items()}
 
 
 def key_impls(tree: Any) -> dict[str, str]:
-  """Path of each typed PRNG key -> name of its generator."""
+  """Returns path -> name of the generator of each typed PRNG key."""
   return {
     path: str(jax.random.key_impl(leaf))
     for path, leaf in named(tree).items()
@@ -59,9 +59,9 @@ def key_impls(tree: Any) -> dict[str, str]:
 
 
 def checksums(tree: Any) -> dict[str, int]:
-  """Path of each leaf -> CRC-32 of its bytes, typed keys by their data.
+  """Returns path -> CRC-32 of the bytes of each leaf; typed keys count by their data.
 
-  All processes that hold parts of the leaves must ask for them together.
+  All processes that hold parts of the leaves must call this together.
   """
   devices.barrier()
   return {path: _crc32(_key_data(leaf)) for path, leaf in named(tree).items()}
@@ -76,7 +76,7 @@ def _crc32(array: Any) -> int:
 
 
 def _on_host(array: Any) -> Iterator[Any]:
-  """The array, or if this process lacks parts of it, slabs gathered from all."""
+  """Yields the array, or slabs gathered from all processes if parts are elsewhere."""
   if getattr(array, "is_fully_addressable", True) or array.is_fully_replicated:
     yield array
   elif array.size:
@@ -86,9 +86,9 @@ def _on_host(array: Any) -> Iterator[Any]:
 
 
 def to_plain(tree: Any) -> Any:
-  """The tree with the data of typed keys (u32) in their place.
+  """Returns the tree with typed keys replaced by their data (u32).
 
-  Arrays without elements, which Orbax refuses, become None.
+  Arrays without elements, which Orbax rejects, become None.
   """
   return jax.tree.map(lambda leaf: _key_data(leaf) if leaf.size else None, tree)
 
@@ -97,8 +97,8 @@ def to_typed(tree: Any, impls: Mapping[str, str], example: Any) -> Any:
   """Undoes ``to_plain``, given the ``key_impls`` and shapes of the original tree.
 
   Raises:
-    ValueError: these are not the generators of the keys.
-    TypeError: these are the names of none.
+    ValueError: the generators do not fit the keys.
+    TypeError: a generator is unknown.
   """
 
   def restored(path: Any, like: Any, leaf: jax.Array | None) -> jax.Array:
@@ -114,9 +114,9 @@ def to_typed(tree: Any, impls: Mapping[str, str], example: Any) -> Any:
 
 
 def abstract(tree: Any) -> Any:
-  """ShapeDtypeStructs of ``to_plain(tree)``, each on its leaf's devices.
+  """Returns ShapeDtypeStructs of ``to_plain(tree)``, each on its leaf's devices.
 
-  Leaves that name no device are put on the default one.
+  Leaves without a sharding go to the default device.
   """
   default = jax.sharding.SingleDeviceSharding(jax.devices()[0])
 

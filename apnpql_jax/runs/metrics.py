@@ -1,14 +1,11 @@
-"""Metrics of a run: ``metrics.jsonl``, ``metrics.csv``, ``curve.png``, and extras."""
+"""Metrics of a run: the rows of ``metrics.jsonl``, and the success curve."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-import csv
-import io
 import json
 import math
 from pathlib import Path
-from statistics import NormalDist
 import time
 from typing import Any, Protocol
 
@@ -16,67 +13,57 @@ from apnpql_jax.errors import FileError
 from apnpql_jax.runs.text import write_text
 
 STEP = "step"
-"""Environment steps, summed over worlds; the first column of every row."""
+"""Environment steps, summed over worlds; every row has it."""
 
 WALL = "time/wall_s"
-"""Seconds of training, those before a resume included."""
+"""Seconds of training, including those before a resume."""
 
 SUCCESS = "eval/success_rate"
 EPISODES = "eval/episodes"
 
 MAX_BYTES = 32 << 20
-"""Size at which ``metrics.jsonl`` is put aside as ``metrics.<n>.jsonl``."""
+"""Size above which ``metrics.jsonl`` is renamed to ``metrics.<n>.jsonl``."""
 
 Row = dict[str, float | None]
 
 
-def wilson_interval(
-  successes: int, n: int, *, confidence: float = 0.95
-) -> tuple[float, float]:
-  """Score interval of Wilson (1927) for a share of successes, without continuity.
+def wilson_interval(successes: int, n: int) -> tuple[float, float]:
+  """Returns the 95 % score interval (Wilson, 1927) of a success rate.
 
-  Unlike the normal approximation it stays within [0, 1] and does not shrink to a
-  point at 0 or ``n`` successes.
+  Unlike the normal approximation, it stays within [0, 1] and does not shrink to a point
+  at 0 or ``n`` successes.
 
   Args:
     successes: between 0 and ``n``.
     n: independent episodes; 0 gives (0, 1).
-    confidence: probability that the interval covers the true rate.
 
   Raises:
     ValueError: ``successes`` is not within [0, n].
   """
-  if not 0 <= successes <= n:
-    raise ValueError(f"{successes} successes of {n} episodes")
-  if n == 0:
+  if successes == n == 0:
     return 0.0, 1.0
-  z = NormalDist().inv_cdf(0.5 + confidence / 2)
-  rate, scale = successes / n, 1 + z * z / n
-  center = (rate + z * z / (2 * n)) / scale
-  half = z * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n)) / scale
-  # At the ends the bound is exact; the formula misses it by rounding.
-  low = 0.0 if successes == 0 else center - half
-  return low, 1.0 if successes == n else center + half
+  from scipy.stats import binomtest  # Here, because its import slows the start.
+
+  low, high = binomtest(successes, n).proportion_ci(method="wilson")
+  return float(low), float(high)
 
 
 class Sink(Protocol):
-  """Another place that metrics go to."""
+  """An additional destination for metrics."""
 
   def write(self, step: int, row: Mapping[str, float]) -> None:
-    """Takes the metrics of one step."""
+    """Receives the metrics of one step."""
     ...
 
   def close(self) -> None:
-    """Writes out what is still held back."""
+    """Flushes what is still buffered."""
     ...
 
 
 class MetricWriter:
-  """Appends rows to ``metrics.jsonl`` and ``metrics.csv``, each whole on disk at once.
+  """Appends rows to ``metrics.jsonl``; each is on disk when ``write`` returns.
 
-  The JSONL file is the record, the CSV file a view of it: a metric seen for the first
-  time adds a column, and the CSV is written anew with the old rows empty there. Both
-  are put aside when they have become large, the oldest as number 1.
+  A file that has grown too large is renamed to ``metrics.<n>.jsonl``, starting at 1.
   """
 
   def __init__(
@@ -88,25 +75,23 @@ class MetricWriter:
     clock: Callable[[], float] = time.monotonic,
     max_bytes: int = MAX_BYTES,
   ):
-    """Opens the files, keeping the rows there are.
+    """Opens the file and keeps its rows.
 
     Args:
       run_dir: an existing run folder.
-      resume_step: rows of later steps are dropped; the run will do them again.
-      sinks: more places to write to; closed with this one.
-      clock: seconds; only differences count.
-      max_bytes: of ``metrics.jsonl``, above which a new one is begun.
+      resume_step: drops the rows of later steps; the run repeats those steps.
+      sinks: additional destinations; closed together with this writer.
+      clock: returns seconds; only differences matter.
+      max_bytes: size of ``metrics.jsonl`` above which a new file begins.
 
     Raises:
-      FileError: there are rows that cannot be read.
+      FileError: a row cannot be read.
     """
-    self._jsonl, self._csv = run_dir / "metrics.jsonl", run_dir / "metrics.csv"
+    self._path = run_dir / "metrics.jsonl"
     self._sinks, self._clock, self._max_bytes = tuple(sinks), clock, max_bytes
     rows = self._rows_until(resume_step)
-    # Written anew, because a killed process may have left half a line.
-    write_text(self._jsonl, "".join(_json_line(row) for row in rows))
-    self._columns = list(dict.fromkeys([STEP, WALL, *(k for row in rows for k in row)]))
-    self._write_csv(rows)
+    # Rewritten, because a killed process may have left half a line.
+    write_text(self._path, "".join(_json_line(row) for row in rows))
     self._start = clock() - ((rows[-1].get(WALL) or 0.0) if rows else 0.0)
 
   def write(self, step: int, metrics: Mapping[str, Any]) -> None:
@@ -114,30 +99,20 @@ class MetricWriter:
 
     Args:
       step: environment steps done.
-      metrics: name -> number or array of one element. In JSONL, what is not finite
-        becomes null.
+      metrics: name -> number or array of one element. Values that are not finite
+        become null in the file.
     """
     numbers = {name: _number(value) for name, value in metrics.items()}
     row: Row = {STEP: step, WALL: round(self._clock() - self._start, 3), **numbers}
-    with self._jsonl.open("a", encoding="utf-8") as file:
+    with self._path.open("a", encoding="utf-8") as file:
       file.write(_json_line(row))
-    new = [name for name in row if name not in self._columns]
-    if new:
-      self._columns += new
-      self._write_csv(read_rows(self._jsonl))
-    else:
-      with self._csv.open("a", encoding="utf-8", newline="") as file:
-        csv.DictWriter(file, self._columns).writerow(row)
-    if self._jsonl.stat().st_size > self._max_bytes:
-      number = len(metric_files(self._jsonl.parent))
-      for path in (self._jsonl, self._csv):
-        path.rename(_numbered(path, number))
-      self._write_csv([])
+    if self._path.stat().st_size > self._max_bytes:
+      self._path.rename(_numbered(self._path, len(metric_files(self._path.parent))))
     for sink in self._sinks:
       sink.write(step, numbers)
 
   def close(self) -> None:
-    """Closes the extra sinks; the files are always complete."""
+    """Closes the sinks; the file is always complete."""
     for sink in self._sinks:
       sink.close()
 
@@ -148,37 +123,32 @@ class MetricWriter:
     self.close()
 
   def _rows_until(self, step: int | None) -> list[Row]:
-    """Rows up to ``step`` of the newest file with any; it becomes the present one."""
-    rows = read_rows(self._jsonl)
+    """Returns the rows up to ``step`` of the newest file that has any.
+
+    That file becomes ``metrics.jsonl`` again.
+    """
+    rows = read_rows(self._path)
     if step is None:
       return rows
     kept = [row for row in rows if (row[STEP] or 0) <= step]
-    if not kept and (number := len(metric_files(self._jsonl.parent)) - 1) > 0:
-      _numbered(self._csv, number).unlink(missing_ok=True)
-      _numbered(self._jsonl, number).replace(self._jsonl)
+    if not kept and (number := len(metric_files(self._path.parent)) - 1) > 0:
+      _numbered(self._path, number).replace(self._path)
       return self._rows_until(step)
     return kept
 
-  def _write_csv(self, rows: Sequence[Row]) -> None:
-    text = io.StringIO(newline="")
-    table = csv.DictWriter(text, self._columns)
-    table.writeheader()
-    table.writerows(rows)
-    write_text(self._csv, text.getvalue())
-
 
 def metric_files(run_dir: Path) -> list[Path]:
-  """The JSONL files of a run: those put aside, oldest first, then the present one."""
-  present, aside = run_dir / "metrics.jsonl", []
-  while (path := _numbered(present, len(aside) + 1)).exists():
-    aside.append(path)
-  return [*aside, present]
+  """Returns the metric files of a run, oldest first; the last may not exist."""
+  current, renamed = run_dir / "metrics.jsonl", []
+  while (path := _numbered(current, len(renamed) + 1)).exists():
+    renamed.append(path)
+  return [*renamed, current]
 
 
 def read_evaluations(run_dir: Path) -> list[Row]:
-  """Rows of all evaluations of a run, oldest first."""
-  files, told = metric_files(run_dir), json.dumps(SUCCESS)
-  rows = (row for path in files for row in read_rows(path, having=told))
+  """Returns the rows of all evaluations of a run, oldest first."""
+  key = json.dumps(SUCCESS)
+  rows = (row for path in metric_files(run_dir) for row in read_rows(path, having=key))
   return [row for row in rows if row.get(SUCCESS) is not None]
 
 
@@ -187,15 +157,15 @@ def _numbered(path: Path, number: int) -> Path:
 
 
 def read_rows(path: Path, *, having: str = "") -> list[Row]:
-  """Rows of a ``metrics.jsonl``, oldest first; none if there is no file.
+  """Returns the rows of a metric file, oldest first; none if there is no file.
 
   Args:
     path: the file.
-    having: only lines with this text are looked at, one at a time: of a long run few
-      rows are evaluations.
+    having: skips lines without this text, so that the few evaluations of a long run
+      are read without parsing all of its rows.
 
   Raises:
-    FileError: a line is not a row, other than a last one that was cut off.
+    FileError: a line other than an incomplete last one is not a row.
   """
   if not path.exists():
     return []
@@ -218,15 +188,15 @@ def read_rows(path: Path, *, having: str = "") -> list[Row]:
 def plot_curve(rows: Sequence[Row], path: Path, *, title: str = "") -> bool:
   """Draws the success rate over environment steps and over wall-clock minutes.
 
-  The band is the 95 % interval where rows also tell the number of episodes.
+  The band is the 95 % interval, for rows that hold the number of episodes.
 
   Returns:
-    False, drawing nothing, if no row has an evaluation.
+    False, without drawing, if no row is an evaluation.
   """
   rows = [row for row in rows if row.get(SUCCESS) is not None]
   if not rows:
     return False
-  # Not pyplot: that would choose a display for the whole process.
+  # Not pyplot, which would choose a display for the whole process.
   from matplotlib.backends.backend_agg import FigureCanvasAgg
   from matplotlib.figure import Figure
 

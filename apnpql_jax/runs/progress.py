@@ -1,22 +1,21 @@
-"""What one sees while a run trains: a bar on a terminal, plain lines elsewhere."""
+"""Training progress on standard error: a bar on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
-import collections
 from collections.abc import Callable
 import sys
 import time
-from typing import Any, TextIO
+from typing import TextIO
 
-_WINDOW = 20
-"""Reports that the speeds are averaged over."""
+_SPEED_PERIOD_S = 600.0
+"""Speeds are averaged over this time, which has to span several slow iterations."""
 
 
 class TrainProgress:
-  """Shows success rate, speeds and time left, on standard error.
+  """Display of success rate, speeds and time left.
 
-  Use as a context manager. Speeds start with the second report, so that the time of
-  the first compilation does not count.
+  Use as a context manager. Speeds count from the first update on, so that the first
+  compilation does not lower them.
   """
 
   def __init__(
@@ -27,101 +26,89 @@ class TrainProgress:
     period_s: float = 15.0,
     clock: Callable[[], float] = time.monotonic,
   ):
-    """Sets up; nothing is shown before the first report.
+    """Builds the display without showing it.
 
     Args:
-      total_steps: environment steps at which the run is done.
-      stream: where to write; standard error if None.
+      total_steps: environment steps of the whole run.
+      stream: destination; standard error if None.
       period_s: seconds between two plain lines.
-      clock: seconds; only differences count.
+      clock: returns seconds; only differences matter.
     """
-    self._total, self._period, self._clock = total_steps, period_s, clock
-    self._stream = sys.stderr if stream is None else stream
-    self._reports: collections.deque[tuple[float, int, int]]
-    self._reports = collections.deque(maxlen=_WINDOW)
+    from rich.console import Console
+    from rich.progress import (
+      BarColumn,
+      Progress,
+      TaskProgressColumn,
+      TextColumn,
+      TimeRemainingColumn,
+    )
+
+    stream = stream or sys.stderr
+    self._period, self._clock = period_s, clock
+    self._time_left = TimeRemainingColumn()
+    self._bar = Progress(
+      BarColumn(bar_width=24),
+      TaskProgressColumn(),
+      TextColumn("{task.completed:,} steps  {task.fields[figures]}", markup=False),
+      self._time_left,
+      console=Console(file=stream),
+      speed_estimate_period=_SPEED_PERIOD_S,
+      get_time=clock,
+      disable=not stream.isatty(),
+    )
+    self._bar.add_task("steps", total=total_steps, figures="starting")
+    self._bar.add_task("updates", total=None, visible=False)
+    self._steps, self._updates = self._bar.tasks
     self._success: float | None = None
     self._printed_at = -float("inf")
     self._unprinted = False
-    self._bar: Any = None
-    self._task: Any = None
 
   def __enter__(self) -> TrainProgress:
-    if self._stream.isatty():
-      self._bar = _make_bar(self._stream)
-      self._task = self._bar.add_task("train", total=self._total, figures="starting")
-      self._bar.start()
+    self._bar.start()
     return self
 
   def __exit__(self, *exception: object) -> None:
-    if self._bar is not None:
-      self._bar.stop()
-    elif self._unprinted:
+    self._bar.stop()
+    if self._unprinted:
       self._print_line()
 
   def update(
     self, step: int, *, updates: int, success_rate: float | None = None
   ) -> None:
-    """Reports where the run is.
+    """Shows how far the run is.
 
     Args:
-      step: environment steps done, those before a resume included.
+      step: environment steps done, including those before a resume.
       updates: learner updates done.
-      success_rate: newest success rate in [0, 1]; None keeps the one shown.
+      success_rate: newest success rate in [0, 1]; None keeps the previous one.
     """
-    self._reports.append((self._clock(), step, updates))
     if success_rate is not None:
       self._success = success_rate
-    if self._bar is not None:
-      self._bar.update(self._task, completed=step, figures=self.figures())
-      return
-    self._unprinted = True
-    if self._clock() - self._printed_at >= self._period:
-      self._print_line()
+    self._bar.update(self._updates.id, completed=updates)
+    self._bar.update(self._steps.id, completed=step)
+    self._bar.update(self._steps.id, figures=self._figures())
+    if self._bar.disable:
+      self._unprinted = True
+      if self._clock() - self._printed_at >= self._period:
+        self._print_line()
 
   def message(self, text: str) -> None:
-    """Writes a line that stays, above the bar."""
-    if self._bar is not None:
-      self._bar.console.print(text, markup=False, highlight=False)
-    else:
-      print(text, file=self._stream, flush=True)
+    """Prints a line that stays, above the bar."""
+    self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
-  def figures(self) -> str:
-    """Success rate, environment steps/s, updates/s and time left, as shown."""
+  def _figures(self) -> str:
     success = "--" if self._success is None else f"{100 * self._success:.0f} %"
-    (t0, step0, updates0), (t1, step1, updates1) = self._reports[0], self._reports[-1]
-    if t1 <= t0:
-      return f"success {success}"
-    speed, learning = (step1 - step0) / (t1 - t0), (updates1 - updates0) / (t1 - t0)
-    figures = f"success {success}  {speed:,.0f} steps/s  {learning:,.1f} updates/s"
-    if speed <= 0:
-      return figures
-    return f"{figures}  {_clock_text((self._total - step1) / speed)} left"
+    figures = [f"success {success}"]
+    if steps_per_s := self._steps.speed:
+      figures.append(f"{steps_per_s:,.0f} steps/s")
+    if updates_per_s := self._updates.speed:
+      figures.append(f"{updates_per_s:,.1f} updates/s")
+    return "  ".join(figures)
 
   def _print_line(self) -> None:
-    step = self._reports[-1][1]
-    share = 100 * step / max(self._total, 1)
-    print(
-      f"step {step:,} of {self._total:,} ({share:.0f} %)  {self.figures()}",
-      file=self._stream,
-      flush=True,
+    steps = self._steps
+    self.message(
+      f"step {steps.completed:,} of {steps.total:,} ({steps.percentage:.0f} %)  "
+      f"{steps.fields['figures']}  {self._time_left.render(steps)} left"
     )
     self._printed_at, self._unprinted = self._clock(), False
-
-
-def _make_bar(stream: TextIO) -> Any:
-  from rich.console import Console
-  from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
-
-  return Progress(
-    BarColumn(bar_width=24),
-    TaskProgressColumn(),
-    TextColumn("{task.completed:,} steps"),
-    TextColumn("{task.fields[figures]}", markup=False),
-    console=Console(file=stream),
-  )
-
-
-def _clock_text(seconds: float) -> str:
-  minutes, second = divmod(max(0, round(seconds)), 60)
-  hours, minute = divmod(minutes, 60)
-  return f"{hours}:{minute:02}:{second:02}"

@@ -1,4 +1,4 @@
-"""Metrics to TensorBoard or Weights & Biases, for those who have installed them."""
+"""Optional metric sinks: TensorBoard and Weights & Biases."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from apnpql_jax.runs.metrics import Sink
 
 
 class TensorboardSink:
-  """Event files in ``tensorboard/`` of the run folder (extra ``tb``)."""
+  """Sink to event files in ``tensorboard/`` of the run folder (extra ``tb``)."""
 
   def __init__(self, run_dir: Path, config: Mapping[str, Any]):
-    """Opens the event file; ``config`` is not shown."""
+    """Opens the event file; ``config`` is ignored."""
     del config
     from tensorboardX import SummaryWriter
 
     self._writer = SummaryWriter(logdir=str(run_dir / "tensorboard"))
 
   def write(self, step: int, row: Mapping[str, float]) -> None:
-    """One scalar per metric."""
+    """Writes one scalar per metric."""
     for name, value in row.items():
       self._writer.add_scalar(name, value, step)
 
@@ -32,10 +32,10 @@ class TensorboardSink:
 
 
 class WandbSink:
-  """A run of the project ``apnpql_jax``, named like the folder (extra ``wandb``)."""
+  """Sink to a Weights & Biases run named after the folder (extra ``wandb``)."""
 
   def __init__(self, run_dir: Path, config: Mapping[str, Any]):
-    """Starts the run with the settings of ``config``."""
+    """Starts the run with ``config`` as its settings."""
     import wandb
 
     self._run = wandb.init(
@@ -43,11 +43,11 @@ class WandbSink:
     )
 
   def write(self, step: int, row: Mapping[str, float]) -> None:
-    """All metrics of the step at once."""
+    """Logs all metrics of a step at once."""
     self._run.log(dict(row), step=step)
 
   def close(self) -> None:
-    """Waits for the upload."""
+    """Finishes the run and waits for the upload."""
     self._run.finish()
 
 
@@ -59,10 +59,10 @@ _SINKS = {
 
 
 def check_sinks(names: Sequence[str]) -> None:
-  """Refuses sinks that could not be opened.
+  """Rejects sinks that cannot be opened.
 
   Raises:
-    ConfigError: an unknown name, or its package is not installed.
+    ConfigError: a name is unknown, or its package is not installed.
   """
   for name in names:
     check_name("metric sink", name, list(_SINKS))
@@ -77,11 +77,11 @@ def check_sinks(names: Sequence[str]) -> None:
 def make_sinks(
   names: Sequence[str], run_dir: Path, config: Mapping[str, Any]
 ) -> list[Sink]:
-  """The sinks of these names, opened.
+  """Opens the named sinks.
 
   Args:
-    names: of ``tensorboard`` and ``wandb``.
+    names: any of ``tensorboard`` and ``wandb``.
     run_dir: an existing run folder.
-    config: plain data shown beside the curves.
+    config: plain data shown with the curves.
   """
   return [_SINKS[name][0](run_dir, config) for name in names]

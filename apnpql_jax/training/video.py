@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from fractions import Fraction
 from pathlib import Path
-import subprocess
 
+import av
 import imageio.v3 as iio
-import imageio_ffmpeg
 import jax
 import numpy as np
 
@@ -18,7 +18,14 @@ from apnpql_jax.training.rollout import Episodes
 GREEN = (40, 200, 80)
 RED = (220, 60, 50)
 
-_MACROBLOCK = 16  # common video codecs want sides that are multiples of it
+_GAP = 2
+"""Black pixels between views."""
+
+_BORDER = 4
+"""Width of a border in pixels."""
+
+_MACROBLOCK = 16
+"""Common video codecs need sides that are multiples of this."""
 
 VIEW_SIZE = (506, 674)
 """Height and width of the view of the robot in pixels; both cameras fit beside it, the
@@ -68,87 +75,68 @@ def film(env: Env, played: Episodes) -> list[np.ndarray]:
   return episodes
 
 
-def tile(views: Sequence[np.ndarray], *, gap: int = 2) -> np.ndarray:
+def tile(views: Sequence[np.ndarray]) -> np.ndarray:
   """Puts a large view on the left and the others in a column to its right.
 
   The others are enlarged by whole factors, nearest neighbor, to about the same width,
-  as far as the large view's height has room for them; what remains is black.
+  as far as the height of the large view allows; the rest is black.
 
   Args:
-    views: u8[T, H_i, W_i, 3], the large view first.
-    gap: black pixels between views.
+    views: u8[T, H_i, W_i, 3], the large view first, then at least one other.
 
   Returns:
-    u8[T, H_0, W, 3].
+    u8[T, H, W, 3].
 
   Raises:
-    ValueError: no views, or they are not videos of equal length.
+    ValueError: the views are not videos of equal length.
   """
-  if not views:
-    raise ValueError("no views to tile")
   for view in views:
     _check(view)
     if len(view) != len(views[0]):
       raise ValueError(f"views differ in length: {[len(v) for v in views]}")
   large, others = views[0], views[1:]
-  if not others:
-    return large.copy()
   frames, height = large.shape[:2]
   for factor in range(max(1, height // others[0].shape[1]), 0, -1):
     width = factor * others[0].shape[2]
-    enlarged = [enlarge(v, max(1, round(width / v.shape[2]))) for v in others]
-    needed = sum(v.shape[1] for v in enlarged) + gap * (len(others) - 1)
+    enlarged = [_enlarge(v, max(1, round(width / v.shape[2]))) for v in others]
+    needed = sum(v.shape[1] for v in enlarged) + _GAP * (len(others) - 1)
     if needed <= height:
       break
   width = max(v.shape[2] for v in enlarged)
-  out = np.zeros(
-    (frames, max(height, needed), large.shape[2] + gap + width, 3), np.uint8
-  )
+  left = large.shape[2] + _GAP
+  out = np.zeros((frames, max(height, needed), left + width, 3), np.uint8)
   out[:, :height, : large.shape[2]] = large
-  top, left = 0, large.shape[2] + gap
+  top = 0
   for view in enlarged:
     out[:, top : top + view.shape[1], left : left + view.shape[2]] = view
-    top += view.shape[1] + gap
+    top += view.shape[1] + _GAP
   return out
 
 
-def enlarge(frames: np.ndarray, factor: int) -> np.ndarray:
-  """Repeats every pixel ``factor`` times both ways: u8[T, H * f, W * f, 3]."""
+def _enlarge(frames: np.ndarray, factor: int) -> np.ndarray:
   return frames.repeat(factor, axis=1).repeat(factor, axis=2)
 
 
-def add_border(
-  frames: np.ndarray,
-  color: tuple[int, int, int],
-  *,
-  where: np.ndarray | None = None,
-  width: int = 4,
-) -> np.ndarray:
-  """Draws a border inside the frames, for instance green where an episode succeeded.
+def add_border(frames: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
+  """Returns a copy with a border inside the frames, for instance green for success.
 
   Args:
     frames: u8[T, H, W, 3].
     color: red, green, blue in 0..255.
-    where: bool[T], frames to mark; all of them by default.
-    width: of the border in pixels.
-
-  Returns:
-    A copy with the border.
   """
   _check(frames)
-  out = frames.copy()
-  marked = np.ones(len(frames), bool) if where is None else np.asarray(where, bool)
-  inner = np.zeros(frames.shape[1:3], bool)
-  inner[width : frames.shape[1] - width, width : frames.shape[2] - width] = True
-  out[marked[:, None, None] & ~inner[None]] = color
+  out = np.empty_like(frames)
+  out[:] = color
+  inner = np.s_[:, _BORDER:-_BORDER, _BORDER:-_BORDER]
+  out[inner] = frames[inner]
   return out
 
 
-def write_video(path: str | Path, frames: np.ndarray, *, fps: float) -> Path:
-  """Writes frames as MP4, or as GIF if the path says so.
+def write_video(path: Path, frames: np.ndarray, *, fps: float) -> Path:
+  """Writes frames as MP4, or as GIF if the path ends in ".gif".
 
   Args:
-    path: file to write; any suffix but ".gif" becomes ".mp4".
+    path: file to write; any suffix other than ".gif" becomes ".mp4".
     frames: u8[T, H, W, 3]; padded with black to what the codec needs.
     fps: frames per second of playback.
 
@@ -156,11 +144,10 @@ def write_video(path: str | Path, frames: np.ndarray, *, fps: float) -> Path:
     The path that was written.
 
   Raises:
-    ValueError: the frames are not u8[T, H, W, 3] or there are none.
+    ValueError: the frames are not u8[T, H, W, 3], or there are none.
     OSError: the file cannot be written.
   """
   _check(frames)
-  path = Path(path)
   if path.suffix == ".gif":
     iio.imwrite(path, frames, duration=1000.0 / fps, loop=0)
     return path
@@ -172,22 +159,16 @@ def write_video(path: str | Path, frames: np.ndarray, *, fps: float) -> Path:
 
 
 def _encode(path: Path, frames: np.ndarray, fps: float) -> None:
-  """H.264 by ffmpeg.
-
-  imageio would start it by running Python in a fork, where a thread of JAX may have
-  left a lock behind. In a group of its own, Ctrl-C does not reach it.
-  """
+  """Writes H.264 with PyAV itself: imageio's PyAV plugin cannot set the rate factor."""
   height, width = frames.shape[1:3]
-  raw = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {fps} -i -"
-  # Flat colors and hard edges need a rate factor below the default of 23.
-  coded = "-c:v libx264 -crf 10 -pix_fmt yuv420p -f mp4"
-  command = [imageio_ffmpeg.get_ffmpeg_exe(), *f"-v error -y {raw} {coded}".split()]
-  done = subprocess.run(
-    [*command, str(path)], input=frames.tobytes(), capture_output=True, process_group=0
-  )
-  if done.returncode:
-    lines = done.stderr.decode(errors="replace").strip().splitlines()
-    raise OSError(lines[-1] if lines else f"ffmpeg ended with {done.returncode}")
+  with av.open(str(path), "w") as file:
+    stream = file.add_stream("libx264", Fraction(fps).limit_denominator(1000))
+    stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+    # Flat colors and hard edges need a rate factor below the default of 23.
+    stream.options = {"crf": "10"}
+    for frame in frames:
+      file.mux(stream.encode(av.VideoFrame.from_ndarray(frame)))
+    file.mux(stream.encode())
 
 
 def _check(frames: np.ndarray) -> None:

@@ -1,10 +1,10 @@
-"""Curves and a table from finished runs and their evaluations.
+"""Curves and a table of finished runs and their evaluations.
 
   apnpql train push_plate --seed 0 --run runs/a        # and so on
   apnpql evaluate runs/a --episodes 200 --seed 7 --json > runs/a/evaluation.json
   python experiments/results/summarize.py OUT runs/a runs/b runs/c
 
-Writes OUT/curves.png, OUT/table.md and OUT/<run>.csv (evaluations over steps and time).
+Writes OUT/curves.png, OUT/table.md and OUT/seed_<n>.csv (the evaluations).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-from apnpql_jax.runs.metrics import read_rows
+from apnpql_jax.runs.metrics import read_evaluations
 from apnpql_jax.runs.run_folder import RunFolder, open_run
 
 COLUMNS = ("step", "time/wall_s", "eval/success_rate", "eval/episodes")
@@ -27,13 +27,13 @@ GOAL = 0.8
 
 
 def evaluations(folder: RunFolder) -> list[dict[str, float]]:
-  """Step, seconds, rate and number of episodes of each held-out evaluation."""
-  rows = [r for r in read_rows(folder.metrics_jsonl) if "eval/success_rate" in r]
+  """Returns step, seconds, rate and number of episodes of each held-out evaluation."""
+  rows = read_evaluations(folder.path)
   return [{name: row[name] or 0.0 for name in COLUMNS} for row in rows]
 
 
 def table_row(folder: RunFolder) -> str:
-  """Seed, time to the goal, final success with interval, size of the run."""
+  """Returns seed, time to the goal, size of the run, final success with interval."""
   rows = evaluations(folder)
   result = json.loads((folder.path / "evaluation.json").read_text())
   reached = [r for r in rows if r["eval/success_rate"] >= GOAL]
@@ -47,7 +47,7 @@ def table_row(folder: RunFolder) -> str:
 
 
 def plot(folders: list[RunFolder], path: Path) -> None:
-  """Success rate over minutes of wall clock, one line per run."""
+  """Plots the success rate over minutes of wall clock, one line per run."""
   figure, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
   for folder in folders:
     rows = evaluations(folder)
@@ -62,7 +62,7 @@ def plot(folders: list[RunFolder], path: Path) -> None:
 
 
 def main() -> None:
-  """Command line: OUT RUN [RUN ...]."""
+  """Runs the command line: OUT RUN [RUN ...]."""
   out, *runs = map(Path, sys.argv[1:])
   folders = sorted(map(open_run, runs), key=lambda folder: folder.config.seed)
   out.mkdir(parents=True, exist_ok=True)

@@ -76,15 +76,15 @@ def test_changed_versions_are_listed(tmp_path: Path):
 def test_a_run_is_replaced_only_when_asked(tmp_path: Path):
   run = tmp_path / "run"
   run_folder.create(run, CONFIG)
-  (run / "metrics.csv").write_text("step\n")
+  (run / "metrics.jsonl").write_text('{"step": 1}\n')
   other = dataclasses.replace(CONFIG, seed=4)
   with pytest.raises(UserError, match="holds a run") as error:
     run_folder.create(run, other)
   assert "\n" not in str(error.value)
-  assert run_folder.open_run(run).config == CONFIG and (run / "metrics.csv").exists()
+  assert run_folder.open_run(run).config == CONFIG and (run / "metrics.jsonl").exists()
   run_folder.create(run, other, overwrite=True)
   assert run_folder.open_run(run).config == other
-  assert not (run / "metrics.csv").exists()
+  assert not (run / "metrics.jsonl").exists()
   assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
@@ -122,7 +122,7 @@ def test_a_text_file_is_written_whole_or_not_at_all(tmp_path: Path):
 
 
 def test_the_command_line_loads_none_of_the_heavy_packages():
-  heavy = "jax orbax matplotlib rich flax mujoco numpy".split()
+  heavy = "jax orbax matplotlib rich flax mujoco numpy scipy".split()
   code = (
     "import sys, apnpql_jax.cli.main, apnpql_jax.runs.metrics,"
     "apnpql_jax.runs.progress, apnpql_jax.runs.run_folder, apnpql_jax.runs.sinks;"
