@@ -110,7 +110,7 @@ def test_a_run_killed_at_random_moments_ends_as_if_nothing_had_been(tmp_path, ki
 )
 def test_a_run_resumed_in_a_new_process_is_the_run_that_was_not(backend, obs):
   """For other engines and observations, compiled as any run is."""
-  command = [sys.executable, str(tiny.ROOT / "benchmarks" / "resume.py")]
+  command = [sys.executable, "-m", "benchmarks.reliability.resume"]
   command += ["--backend", backend, "--obs", obs]
   env = os.environ | {"PYTHONPATH": str(tiny.ROOT)}
   done = subprocess.run(command, env=env, capture_output=True, text=True)

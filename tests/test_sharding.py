@@ -22,7 +22,6 @@ from typing import Any
 from hand_made import SLOW_MJX
 import jax
 import jax.numpy as jnp
-import messages
 import numpy as np
 import pytest
 import tiny
@@ -41,6 +40,7 @@ from apnpql_jax.iteration import (
   shardings,
 )
 from apnpql_jax.rollout import agent_policy, rollout
+from benchmarks.speed import messages
 
 DEVICES = 4
 ITERATIONS = 3

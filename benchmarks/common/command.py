@@ -5,8 +5,6 @@ A report is one JSON object: the machine, the settings, and a list of results. W
 each result.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterable, Sequence
 import json

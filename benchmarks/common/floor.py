@@ -54,20 +54,19 @@ def machine_peak() -> Peak:
   square = jnp.ones((size, size))
   # Larger than any cache, and in place, because fresh memory costs page faults.
   copied = jnp.ones(length)
-  with turns.measuring("peak"):
-    product = _fastest(jax.jit(lambda x: square @ x / size), jnp.copy(square), calls=50)
+  with turns.turn("peak"):
+    product = _fastest(jax.jit(lambda x: square @ x / size), jnp.copy(square))
     copy = _fastest(jax.jit(lambda x: x + 1.0, donate_argnums=0), copied)
-  return Peak(2 * size**3 / product, 2 * nbytes(copied) / copy)
+  return Peak(2 * size**3 / product, 8 * length / copy)
 
 
-def _fastest(step: Callable[[Any], Any], carry: Any, calls: int = 20) -> float:
-  carry = jax.block_until_ready(step(carry))
-  fastest = float("inf")
-  for _ in range(calls):
+def _fastest(step: Callable[[Any], Any], carry: Any) -> float:
+  seconds = []
+  for _ in range(50):
     began = time.perf_counter()
     carry = jax.block_until_ready(step(carry))
-    fastest = min(fastest, time.perf_counter() - began)
-  return fastest
+    seconds.append(time.perf_counter() - began)
+  return min(seconds)
 
 
 def count(function: Callable[..., Any], *args: Any) -> Work:

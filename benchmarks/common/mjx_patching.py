@@ -1,7 +1,5 @@
 """MJX with or without the patches of ``sim.mjx_patches``."""
 
-from __future__ import annotations
-
 from collections.abc import Generator
 import contextlib
 from unittest import mock

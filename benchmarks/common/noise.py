@@ -1,7 +1,5 @@
 """Batches of noise with the shapes of a training."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

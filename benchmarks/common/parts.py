@@ -4,13 +4,11 @@ They are physics, rendering and networks (the policy encodes, draws candidates a
 one). The rest is what an environment or an iteration takes beyond its parts.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 import copy
 import dataclasses
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -31,15 +29,8 @@ from benchmarks.common import floor, timing
 PLAYED = 5
 """Rollouts before anything is timed: nothing moves yet at the reset."""
 
-_substep_flops: dict[tuple[str, bool], float] = {}
-"""Operations of one world, by fingerprint of the scene and whether contacts count."""
-
-
-class Part(NamedTuple):
-  """Duration of a part of a control period or of an iteration, for all worlds."""
-
-  seconds: float
-  floor_s: float
+Part = tuple[float, float]
+"""Seconds and floor of a part, for all worlds."""
 
 
 def random_policy(state: EnvState, key: Array) -> tuple[Array, Array]:
@@ -66,8 +57,7 @@ def prepare(
 ) -> dict[str, timing.Ready]:
   """Compiles the parts of a control period from ``state``, for all worlds."""
   action = random_actions(jax.random.key(0), state.elapsed.shape[0])
-  velocity, close = action[:, :ARM_DOF], action[:, ARM_DOF]
-  moving = (state.physics, velocity, close)
+  moving = (state.physics, action[:, :ARM_DOF], action[:, ARM_DOF])
   work = physics_work(env.physics, state.physics)
   found = {"physics": _ready(env.physics.step, moving, work)}
   if env.config.obs == "pixels":
@@ -88,23 +78,18 @@ def _ready(
   return timing.Ready(functools.partial(run, *args), floor_s)
 
 
-def shares(whole_s: float, parts: dict[str, Part]) -> dict[str, dict[str, float]]:
+def shares(whole_s: float, parts: Mapping[str, Part]) -> dict[str, dict[str, float]]:
   """Returns the share of each part and of the rest, for a report.
 
-  Parts may add up to more than the whole. Then their sum is the whole, and the rest is
-  zero.
+  If the parts add up to more than the whole, shares are of their sum, without a rest.
   """
-  sum_s = sum(part.seconds for part in parts.values())
-  total_s = max(whole_s, sum_s)
+  total_s = max(whole_s, sum(seconds for seconds, _ in parts.values()))
   found = {
-    name: {
-      "share": part.seconds / total_s,
-      "seconds": part.seconds,
-      **floor.compare(part.floor_s, part.seconds),
-    }
-    for name, part in parts.items()
+    name: {"share": s / total_s, "seconds": s, **floor.compare(floor_s, s)}
+    for name, (s, floor_s) in parts.items()
   }
-  return found | {"rest": {"share": (total_s - sum_s) / total_s}}
+  rest = total_s - sum(seconds for seconds, _ in parts.values())
+  return found | {"rest": {"share": rest / total_s}}
 
 
 def physics_work(engine: Physics, state: PhysicsState) -> floor.Work:
@@ -113,17 +98,15 @@ def physics_work(engine: Physics, state: PhysicsState) -> floor.Work:
   Operations of C MuJoCo cannot be counted. Those of MJX without contacts replace them,
   because C MuJoCo computes only the contacts that occur.
   """
-  scene, contacts = engine.scene, engine.name == "mjx"
-  if (known := (scene.fingerprint, contacts)) not in _substep_flops:
-    if not contacts:
-      model = copy.copy(scene.model)
-      model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-      # Without contacts both cones are the same, but MJX refuses the elliptic one.
-      model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
-      scene = dataclasses.replace(scene, model=model)
-    world = jax.tree.map(lambda x: x[:1], state)
-    step = MjxPhysics(scene, substeps=1).step
-    one = floor.count(step, world, jnp.zeros((1, ARM_DOF)), jnp.zeros(1))
-    _substep_flops[known] = one.flops
-  flops = SUBSTEPS * len(state.time) * _substep_flops[known]
+  scene = engine.scene
+  if engine.name != "mjx":
+    model = copy.copy(scene.model)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    # Without contacts both cones are the same, but MJX refuses the elliptic one.
+    model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    scene = dataclasses.replace(scene, model=model)
+  world = jax.tree.map(lambda x: x[:1], state)
+  step = MjxPhysics(scene, substeps=1).step
+  one = floor.count(step, world, jnp.zeros((1, ARM_DOF)), jnp.zeros(1))
+  flops = SUBSTEPS * len(state.time) * one.flops
   return floor.Work(flops, 2 * floor.nbytes(state))

@@ -1,7 +1,5 @@
 """Settings in which environment and training are timed."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterator
 import dataclasses
@@ -31,29 +29,22 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def measure_each(
   args: argparse.Namespace, measure: Callable[[TrainConfig, int], dict[str, Any]]
 ) -> Iterator[dict[str, Any]]:
-  """Measures the preset of every setting for which the memory suffices."""
-  for setting, config in chosen(args):
-    try:
-      yield setting | measure(config, args.repeats)
-    except ConfigError as error:
-      print(f"{setting}: {error}", file=sys.stderr)
+  """Measures the preset of every combination of the flags, see ``--worlds``.
 
-
-def chosen(args: argparse.Namespace) -> Iterator[tuple[dict[str, Any], TrainConfig]]:
-  """Yields every combination of the flags, see ``--worlds``, with its preset."""
+  Settings for which the memory does not suffice are left out.
+  """
   lists = (args.tasks, args.backends, args.obs, args.worlds)
   if args.quick:
     lists = (["push_plate"], ["native"], args.obs, [4])
-  for values in itertools.product(*lists):
-    names = ("task", "backend", "obs", "worlds")
-    setting: dict[str, Any] = dict(zip(names, values, strict=True))
-    if setting["task"] != lists[0][0] and setting["worlds"] != lists[3][0]:
+  for task, backend, obs, worlds in itertools.product(*lists):
+    setting = {"task": task, "backend": backend, "obs": obs, "worlds": worlds}
+    if task != lists[0][0] and worlds != lists[3][0]:
       continue
-    base = preset(setting["task"], quick=args.quick)
-    yield (
-      setting,
-      dataclasses.replace(base, env=dataclasses.replace(base.env, **setting)),
-    )
+    try:
+      config = changed(preset(task, quick=args.quick), "env", **setting)
+      yield setting | measure(config, args.repeats)
+    except ConfigError as error:
+      print(f"{setting}: {error}", file=sys.stderr)
 
 
 def preset(name: str, *, quick: bool) -> TrainConfig:
@@ -61,23 +52,18 @@ def preset(name: str, *, quick: bool) -> TrainConfig:
   if not quick:
     return load_preset(name)
   sizes = {"global_size": (12, 16), "wrist_size": (8, 12)}
-  env = dataclasses.replace(tiny.CONFIG.env, obs="pixels", **sizes)
-  return dataclasses.replace(tiny.CONFIG, env=env)
+  return changed(tiny.CONFIG, "env", obs="pixels", **sizes)
+
+
+def changed(config: TrainConfig, section: str, **values: Any) -> TrainConfig:
+  """Returns a training with other values in its agent, env or replay."""
+  part = dataclasses.replace(getattr(config, section), **values)
+  return dataclasses.replace(config, **{section: part})
 
 
 def with_candidates(config: TrainConfig, count: int) -> TrainConfig:
   """Returns the same training with another number of candidates."""
   # Epsilon must stay below the log of the candidates; it costs no time.
-  agent = dataclasses.replace(
-    config.agent,
-    target_samples=count,
-    policy_samples=count,
-    epsilon=min(config.agent.epsilon, 1.0),
-  )
-  return dataclasses.replace(config, agent=agent)
-
-
-def with_batch(config: TrainConfig, size: int) -> TrainConfig:
-  """Returns the same training with another batch size."""
-  replay = dataclasses.replace(config.replay, batch_size=size)
-  return dataclasses.replace(config, replay=replay)
+  epsilon = min(config.agent.epsilon, 1.0)
+  counts = {"target_samples": count, "policy_samples": count}
+  return changed(config, "agent", **counts, epsilon=epsilon)

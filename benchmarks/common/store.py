@@ -1,7 +1,5 @@
 """Stored results, and the machine they come from."""
 
-from __future__ import annotations
-
 import contextlib
 from importlib import metadata
 import json

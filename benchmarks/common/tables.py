@@ -1,7 +1,5 @@
 """Markdown tables, and the marked blocks of documents that hold them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any

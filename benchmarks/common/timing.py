@@ -44,25 +44,17 @@ class Times:
 
   def rate(self, unit: str) -> dict[str, float]:
     """Returns units per second; the CPU time shows whether the machine was busy."""
-    return {
-      **spread(f"{unit}s_per_s", [1.0 / x for x in self.wall]),
-      f"cpu_us_per_{unit}": 1e6 * statistics.median(self.cpu),
-    }
+    cpu_us = {f"cpu_us_per_{unit}": 1e6 * statistics.median(self.cpu)}
+    return spread(f"{unit}s_per_s", [1.0 / x for x in self.wall]) | cpu_us
 
 
 @dataclasses.dataclass(frozen=True)
 class Ready:
   """A compiled program that waits to be timed."""
 
-  run: Callable[[], Any]
-  """Returns all arrays that it computes."""
-
-  floor_s: float | None
-  """Least seconds of one unit of its work; None if it cannot be counted."""
-
-  units: int = 1
-  """Units of work per call, such as updates."""
-
+  run: Callable[[], Any]  # returns all arrays that it computes
+  floor_s: float | None  # least seconds of a unit of its work; None if not counted
+  units: int = 1  # of work per call, such as updates
   compile_s: float = 0.0
 
   def figures(self, unit: str, times: Times) -> dict[str, float]:
@@ -88,9 +80,7 @@ class Carried:
     return self._step(self.carry)
 
 
-def compiled(
-  jitted: Any, *args: Any, options: Mapping[str, Any] | None = None
-) -> tuple[Any, float]:
+def compiled(jitted: Any, *args: Any, options: Any = None) -> tuple[Any, float]:
   """Compiles a jitted function for these arguments, with XLA's ``options``.
 
   Returns:
@@ -99,7 +89,7 @@ def compiled(
   Raises:
     ConfigError: the program needs more memory than there is.
   """
-  with turns.compiling():
+  with turns.turn(shared=True):
     began = time.perf_counter()
     program = jitted.lower(*args).compile(compiler_options=options)
     seconds = time.perf_counter() - began
@@ -120,27 +110,29 @@ def figures(
 def measure(
   ready: Mapping[Key, Ready], *, repeats: int, seconds: float = SECONDS
 ) -> dict[Key, Times]:
-  """Times programs in turns.
+  """Times programs in turns, after two calls of each that do not count.
 
   Args:
     ready: the programs.
-    repeats: how often each is timed, after two calls that do not count.
+    repeats: how often each is timed.
     seconds: least duration of a repeat.
 
   Returns:
     the times of one unit of each program's work.
   """
-  with turns.measuring():
-    calls = {}
+  calls: dict[Key, int] = {}
+  taken: dict[Key, list[tuple[float, float]]] = {key: [] for key in ready}
+  with turns.turn():
     for key, each in ready.items():
       _time(each.run, 1)
       calls[key] = max(1, math.ceil(seconds / _time(each.run, 1)[0]))
-    rounds = [
-      {key: _time(each.run, calls[key]) for key, each in ready.items()}
-      for _ in range(repeats)
-    ]
-  times = {key: Times(*zip(*(r[key] for r in rounds), strict=True)) for key in ready}
-  return {key: times[key].per(calls[key] * each.units) for key, each in ready.items()}
+    for _ in range(repeats):
+      for key, each in ready.items():
+        taken[key].append(_time(each.run, calls[key]))
+  return {
+    key: Times(*zip(*taken[key], strict=True)).per(calls[key] * each.units)
+    for key, each in ready.items()
+  }
 
 
 def spread(name: str, values: Sequence[float]) -> dict[str, float]:

@@ -4,8 +4,6 @@ The GPU suite names a folder of lock files in the environment. Without it a proc
 alone, and every turn is free.
 """
 
-from __future__ import annotations
-
 from collections.abc import Generator
 import contextlib
 import fcntl
@@ -17,25 +15,12 @@ FOLDER = "BENCHMARK_TURNS"
 
 
 @contextlib.contextmanager
-def compiling() -> Generator[None]:
-  """Waits until nobody measures; others may compile at the same time."""
-  with _lock("device", fcntl.LOCK_SH):
-    yield
-
-
-@contextlib.contextmanager
-def measuring(what: str = "device") -> Generator[None]:
-  """Waits until nobody compiles or measures, and keeps others from both."""
-  with _lock(what, fcntl.LOCK_EX):
-    yield
-
-
-@contextlib.contextmanager
-def _lock(name: str, kind: int) -> Generator[None]:
+def turn(name: str = "device", *, shared: bool = False) -> Generator[None]:
+  """Waits for a turn: to measure alone, or ``shared`` with others who compile."""
   folder = os.environ.get(FOLDER)
   if folder is None:
     yield
     return
   with (Path(folder) / name).open("w") as file:
-    fcntl.flock(file, kind)  # Closing the file releases it.
-    yield
+    fcntl.flock(file, fcntl.LOCK_SH if shared else fcntl.LOCK_EX)
+    yield  # Closing the file releases the lock.

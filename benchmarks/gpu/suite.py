@@ -10,8 +10,6 @@ compiles. The file is complete after every result. A section that fails or excee
 budget keeps its earlier results, and its status says why it ended.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 import concurrent.futures
 import contextlib
@@ -31,7 +29,7 @@ from benchmarks.common import command, store, turns
 
 _UPDATES = "speed.learner --batch 64 512 --candidates 120 --phi once"
 SECTIONS = {
-  "training": "gpu.training",
+  "training from pixels": "gpu.training",
   "env_steps": "speed.env_steps --backends mjx --tasks push_plate --worlds 1024 4096",
   "learner": _UPDATES,
   "end_to_end": "speed.end_to_end --backends mjx --tasks push_plate --worlds 512",
@@ -46,11 +44,8 @@ SECTIONS = {
 }
 """Name -> benchmark and its arguments, the most important first."""
 
-OUT_OF_TIME = "stopped: out of time"
-
 
 def main(argv: Sequence[str] | None = None) -> None:
-  """Runs the command line; see the module's docstring."""
   began = time.monotonic()
   parser = command.parser(__doc__)
   flag = parser.add_argument
@@ -82,7 +77,7 @@ class Suite:
     Args:
       out: file of the report.
       folder: for the locks of ``turns``.
-      deadline: of all sections, in seconds of the monotonic clock.
+      deadline: of all sections, by the monotonic clock, s.
     """
     self.report: dict[str, Any] = {"commit": store.commit(), "sections": {}}
     self._out, self._deadline, self._lock = out, deadline, threading.Lock()
@@ -100,17 +95,10 @@ class Suite:
     results = section["report"]["results"]
     self._put(name, section)
     command = [sys.executable, "-m", f"benchmarks.{args[0]}", *args[1:]]
-    with (
-      tempfile.TemporaryFile("w+") as errors,
-      subprocess.Popen(
-        command,
-        stdout=subprocess.PIPE,
-        stderr=errors,
-        env=self._env,
-        start_new_session=True,
-        text=True,
-      ) as process,
-    ):
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "text": True}
+    pipes |= {"env": self._env, "start_new_session": True}
+    with tempfile.TemporaryFile("w+") as errors:
+      process = subprocess.Popen(command, stderr=errors, **pipes)
       late = threading.Timer(self._deadline - began, _kill, [process])
       late.start()
       for line in process.stdout or ():
@@ -125,10 +113,8 @@ class Suite:
       late.cancel()
       errors.seek(0)
       lines = errors.read().strip().splitlines()
-    if code == -signal.SIGKILL:
-      section["status"] = OUT_OF_TIME
-    else:
-      section["status"] = f"failed: {lines[-1:] or code}" if code else "done"
+    failed = f"failed: {lines[-1] if lines else code}"
+    section["status"] = {0: "done", -signal.SIGKILL: "out of time"}.get(code, failed)
     section["seconds"] = time.monotonic() - began
     self._put(name, section)
     return f"{name}: {section['status']}, {len(results)} results {results[-1:]}"

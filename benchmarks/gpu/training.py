@@ -6,10 +6,8 @@ Runs `apnpql train` with more worlds and a larger batch than the preset of the C
 environment step still has 16 transitions in updates.
 """
 
-from __future__ import annotations
-
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 import statistics
 import tempfile
@@ -29,7 +27,6 @@ ENDLESS = ["--total-steps", "1000000000"]
 
 
 def main() -> None:
-  """Runs the command line; see the module's docstring."""
   parser = command.parser(__doc__)
   parser.add_argument("--seconds", type=float, default=45, help="after an iteration")
   args = command.parse(parser)
@@ -40,27 +37,23 @@ def main() -> None:
 def measure(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
   """Yields the figures of a training, during which nobody else measures."""
   options = tiny.PRESET_ARGS if args.quick else OPTIONS
-  with turns.compiling(), tempfile.TemporaryDirectory() as name:
+  with turns.turn(shared=True), tempfile.TemporaryDirectory() as name:
     run = Path(name) / "run"
     with compile_time.training(["push_plate", *options, *ENDLESS], run) as started:
       time.sleep(args.seconds)
       rows = [row for row in tiny.rows(run) if "loss/q" in row]
-  yield {"first_iteration_s": started, **figures(rows)}
-
-
-def figures(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
-  """Returns progress, rates and successes of the iterations of a run."""
-  success = sum(row["rollout/successes"] for row in rows)
-  ended = success + sum(row["rollout/timeouts"] for row in rows)
-  return {
-    "iterations": len(rows),
-    "env_steps": rows[-1]["step"],
+  figures = {
     "steps_per_s": statistics.median(row["time/sps_e2e"] for row in rows),
     "updates_per_s": statistics.median(row["time/updates_per_s"] for row in rows),
-    "success_rate": success / ended if ended else 0.0,
-    "skipped_updates": sum(row["faults/updates"] for row in rows),
-    "broken_worlds": sum(row["faults/worlds"] for row in rows),
   }
+  for key in (
+    "rollout/successes",
+    "rollout/timeouts",
+    "faults/updates",
+    "faults/worlds",
+  ):
+    figures[key] = sum(row[key] for row in rows)
+  yield {"first_iteration_s": started, "env_steps": rows[-1]["step"], **figures}
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """Tables of each benchmark's report, as Markdown."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 import math
 from typing import Any

@@ -1,6 +1,5 @@
 """Ratios of this project's speed to that of other libraries on the same machine.
 
-  python -m benchmarks.peers.compare --quick
   python -m benchmarks.peers.compare --store
 
 Each peer is set up as its users would, see ``PEERS``, in processes of its own. So is
@@ -9,8 +8,6 @@ one round; the report has the median over the rounds with the lowest and the hig
 Peers that are not installed (``pip install -e '.[peers]'``) or do not answer in time
 are reported as missing.
 """
-
-from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
@@ -57,8 +54,6 @@ _STEPS = ("cameras", "physics")
 _WORLDS = {"side": "worlds", "backend": "auto", "stock": False, "periods": 4}
 # Small, because stock MJX takes seconds for a control period of a few worlds on a CPU.
 _MJX = _WORLDS | {"backend": "mjx", "periods": 1, "worlds": 16}
-# One draw of the arm, summed over both gripper commands.
-_SAC = {"side": "learner", "algorithm": "sac", "candidates": 2, "features": "map"}
 
 PEERS = {
   "pybullet": Peer(
@@ -83,19 +78,28 @@ PEERS = {
   ),
   "torch": Peer(
     "the same learner in plain PyTorch: eager mode, Adam, library distributions",
-    *("torch_learner", ("updates",), {"side": "learner", "algorithm": "ap_npql"}),
-  ),
-  "brax": Peer(
-    "Brax's SAC with its vision networks, one jitted update, against our row sac with "
-    "maps of both cameras, as Brax has them; both draw one action",
-    *("brax_sac", ("updates",), _SAC),
+    *("torch_learner", ("updates",), {"side": "learner"}),
   ),
 }
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-  """Runs the command line; see the module's docstring."""
-  args = _arguments(argv)
+  parser = command.parser(__doc__)
+  flag = parser.add_argument
+  flag("--peers", nargs="+", choices=PEERS, default=list(PEERS))
+  flag("--task", choices=task_names(), default="push_plate")
+  flag("--preset", choices=preset_names(), default="push_plate")
+  flag("--processes", type=int, default=10, help="the paper has 10")
+  flag("--worlds", type=int, default=64, help="of ours at once")
+  flag("--batch", type=int, default=64)
+  flag("--candidates", type=int, default=120)
+  flag("--rounds", type=int, default=5)
+  flag("--seconds", type=float, default=4.0, help="of work per figure")
+  flag("--limit", type=float, default=900.0, help="s for an answer")
+  args = command.parse(parser, argv)
+  if args.quick:
+    args.processes, args.worlds, args.batch, args.candidates = 2, 4, 8, 8
+    args.rounds, args.seconds = 1, 0.2
   sizes = {name: getattr(args, name) for name in SIZES}
   with tempfile.TemporaryDirectory() as folder:
     worlds.export(args.task, None, Path(folder))
@@ -115,7 +119,7 @@ def compare(name: str, settings: Result, args: argparse.Namespace) -> Iterator[R
   their, our = settings | peer.settings, settings | peer.ours
   try:
     with (
-      sides.Side(peer.module, their, count=count, env=env, limit_s=limit_s) as theirs,
+      sides.Side(peer.module, their, count=count, limit_s=limit_s, **env) as theirs,
       sides.Side("ours", our, limit_s=limit_s) as ours,
     ):
       for rate in peer.rates:
@@ -130,13 +134,11 @@ def compare(name: str, settings: Result, args: argparse.Namespace) -> Iterator[R
 
 def ratio(both: Sequence[sides.Side], name: str, args: argparse.Namespace) -> Result:
   """Measures both in turns, after one round that does not count."""
-  rounds = [
-    [side.rate(name, args.seconds) for side in both] for _ in range(1 + args.rounds)
-  ]
-  mine, others = zip(*rounds[1:], strict=True)
-  ratios = [one / other for one, other in zip(mine, others, strict=True)]
-  found = timing.spread("ratio", ratios)
-  return {**found, "ours_per_s": mine, "theirs_per_s": others}
+  rounds = range(1 + args.rounds)
+  rates = [[side.rate(name, args.seconds) for side in both] for _ in rounds][1:]
+  found = timing.spread("ratio", [ours / theirs for ours, theirs in rates])
+  ours_per_s, theirs_per_s = zip(*rates, strict=True)
+  return {**found, "ours_per_s": ours_per_s, "theirs_per_s": theirs_per_s}
 
 
 def graphics() -> str:
@@ -150,26 +152,6 @@ def graphics() -> str:
     if not done.returncode:
       return name
   return "disable"
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-  parser = command.parser(__doc__)
-  flag = parser.add_argument
-  flag("--peers", nargs="+", choices=PEERS, default=list(PEERS))
-  flag("--task", choices=task_names(), default="push_plate")
-  flag("--preset", choices=preset_names(), default="push_plate")
-  flag("--processes", type=int, default=10, help="the paper has 10")
-  flag("--worlds", type=int, default=64, help="of ours at once")
-  flag("--batch", type=int, default=64)
-  flag("--candidates", type=int, default=120)
-  flag("--rounds", type=int, default=5)
-  flag("--seconds", type=float, default=4.0, help="of work per figure")
-  flag("--limit", type=float, default=900.0, help="s for an answer")
-  args = command.parse(parser, argv)
-  if args.quick:
-    args.processes, args.worlds, args.batch, args.candidates = 2, 4, 8, 8
-    args.rounds, args.seconds = 1, 0.2
-  return args
 
 
 if __name__ == "__main__":

@@ -6,9 +6,6 @@ worlds and waits for the slowest; otherwise processes run freely. The renderer d
 without shadows and multisampling, which makes its images ten times cheaper.
 """
 
-from __future__ import annotations
-
-from collections.abc import Mapping
 import functools
 import os
 from typing import Any
@@ -77,13 +74,12 @@ class MujocoEnv:
     angle = data.qpos[self._qpos[6]].clip(0.0, 1.1)
     slope = 2 * FINGER_LENGTH * np.sin(angle + FINGER_ANGLE)
     speed = (2 * action[6] - 1) * GRIPPER_SPEED / slope
-    torque = np.append(
-      self._force[arm] + data.qfrc_bias[arm], GRIPPER_GAIN * (speed - data.qvel[finger])
-    )
+    close = GRIPPER_GAIN * (speed - data.qvel[finger])
+    torque = np.append(self._force[arm] + data.qfrc_bias[arm], close)
     return torque.clip(-self._limit, self._limit)
 
 
-def build(settings: Mapping[str, Any]) -> sides.Built:
+def build(settings: sides.Settings) -> sides.Built:
   """Builds one world, or all those of AsyncVectorEnv."""
   about = {"graphics": os.environ.get("MUJOCO_GL", "")}
   if not settings["gymnasium"]:
@@ -91,14 +87,13 @@ def build(settings: Mapping[str, Any]) -> sides.Built:
     return worlds.measures(env, settings["seed"]), about
   import gymnasium
 
-  measures = {
-    name: gymnasium_measure(settings, images=name == "cameras")
-    for name in ("cameras", "physics")
-  }
-  return measures, about | {"gymnasium": gymnasium.__version__}
+  cameras = gymnasium_measure(settings, images=True)
+  physics = gymnasium_measure(settings, images=False)
+  about |= {"gymnasium": gymnasium.__version__}
+  return {"cameras": cameras, "physics": physics}, about
 
 
-def gymnasium_measure(settings: Mapping[str, Any], *, images: bool) -> sides.Measure:
+def gymnasium_measure(settings: sides.Settings, *, images: bool) -> sides.Measure:
   """Returns a measure of AsyncVectorEnv, which starts at the first request."""
   from gymnasium.vector import AsyncVectorEnv
 

@@ -3,11 +3,8 @@
 Each compiles at its first measurement, which does not count.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 import contextlib
-import dataclasses
 import functools
 from typing import Any
 
@@ -15,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config import EnvConfig, TrainConfig
+from apnpql_jax.config import EnvConfig
 from apnpql_jax.env import make_env
 from apnpql_jax.env_state import EnvState
 from apnpql_jax.presets import load_preset
@@ -23,19 +20,19 @@ from apnpql_jax.rollout import rollout
 from apnpql_jax.types import Array, Transition
 from benchmarks.common import noise, parts
 from benchmarks.common.mjx_patching import patched
-from benchmarks.common.settings import with_batch, with_candidates
+from benchmarks.common.settings import changed, with_candidates
 from benchmarks.peers import sides
 from benchmarks.peers.worlds import EPISODE_STEPS
 from benchmarks.speed.learner import nth_update
 
 
-def build(settings: Mapping[str, Any]) -> sides.Built:
+def build(settings: sides.Settings) -> sides.Built:
   """Builds what ``settings["side"]`` names."""
   make = {"worlds": worlds, "learner": learner}[settings["side"]]
   return make(settings), {"backend": jax.default_backend()}
 
 
-def worlds(settings: Mapping[str, Any]) -> dict[str, sides.Measure]:
+def worlds(settings: sides.Settings) -> dict[str, sides.Measure]:
   """Returns measures of control steps of all worlds: whole, or physics only."""
   config = EnvConfig(
     task=settings["task"], backend=settings["backend"], worlds=settings["worlds"]
@@ -65,9 +62,11 @@ def worlds(settings: Mapping[str, Any]) -> dict[str, sides.Measure]:
   }
 
 
-def learner(settings: Mapping[str, Any]) -> dict[str, sides.Measure]:
+def learner(settings: sides.Settings) -> dict[str, sides.Measure]:
   """Returns a measure of updates on noise, in a loop as long as an iteration."""
-  config = learner_config(settings)
+  config = load_preset(settings["preset"])
+  config = changed(config, "replay", batch_size=settings["batch"])
+  config = with_candidates(config, settings["candidates"])
   agent, batch = make_agent(config.agent), noise.transitions(config)
   state = agent.init(jax.random.key(0), batch.observation_tm1)
   count = config.updates_per_iteration
@@ -83,25 +82,17 @@ def learner(settings: Mapping[str, Any]) -> dict[str, sides.Measure]:
   return {"updates": sides.rate_of(run, count)}
 
 
-def learner_config(settings: Mapping[str, Any]) -> TrainConfig:
-  """Returns the preset with algorithm, batch, candidates and features as asked for."""
-  config = with_batch(load_preset(settings["preset"]), settings["batch"])
-  config = with_candidates(config, settings["candidates"])
-  changes = {"algorithm": settings["algorithm"]}
-  if features := settings.get("features"):
-    changes |= {"global_features": features, "wrist_features": features}
-  agent = dataclasses.replace(config.agent, **changes)
-  return dataclasses.replace(config, agent=agent)
-
-
 def _played(
   advance: Callable[[Any, Array], Any], start: Any, periods: int, worlds: int
 ) -> sides.Measure:
   """Returns a measure that plays from call to call and restarts after an episode."""
+  state, calls = start, 0
 
-  def step(state: Any, call: int) -> Any:
-    again = call % (EPISODE_STEPS // periods) == 0
-    after = advance(start if again else state, jax.random.key(call))
-    return jax.block_until_ready(after)
+  def run() -> None:
+    nonlocal state, calls
+    again = calls % (EPISODE_STEPS // periods) == 0
+    state = advance(start if again else state, jax.random.key(calls))
+    jax.block_until_ready(state)
+    calls += 1
 
-  return sides.rate_of(sides.carried(step, start), periods * worlds)
+  return sides.rate_of(run, periods * worlds)

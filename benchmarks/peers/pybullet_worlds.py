@@ -6,15 +6,11 @@ acceleration, its fingers no linkage, and its contacts default parameters. Image
 without the segmentation, which the learner does not need.
 """
 
-from __future__ import annotations
-
-from collections.abc import Mapping
-import functools
+from collections.abc import Sequence
 from pathlib import Path
 import tempfile
 from typing import Any
 
-import mujoco
 import numpy as np
 import pybullet
 from pybullet_utils.bullet_client import BulletClient
@@ -22,8 +18,7 @@ from pybullet_utils.bullet_client import BulletClient
 from benchmarks.peers import sides, urdf, worlds
 
 SUBSTEPS = round(240 * worlds.CONTROL_PERIOD_S)
-FINGER_SPEED = 0.8
-"""rad/s; the pads close at about 75 mm/s."""
+FINGER_SPEED = 0.8  # rad/s; the pads close at about 75 mm/s.
 
 
 class BulletEnv:
@@ -53,27 +48,22 @@ class BulletEnv:
     for joint, link in self._joints.items():
       self.bullet.resetJointState(self._robot, link, qpos[model.jnt_qposadr[joint]])
     for root in urdf.roots(model)[1:]:
-      mocap = model.body_mocapid[root]
-      if mocap >= 0:
-        self._put(
-          root, self.world.mocap_pos[row, mocap], self.world.mocap_quat[row, mocap]
-        )
+      if (mocap := model.body_mocapid[root]) >= 0:
+        poses = (self.world.mocap_pos, self.world.mocap_quat)
+        self._put(root, *(pose[row, mocap] for pose in poses))
       elif urdf.is_free(model, root):
         first = model.jnt_qposadr[model.body_jntadr[root]]
         self._put(root, qpos[first : first + 3], qpos[first + 3 : first + 7])
 
   def step(self, action: np.ndarray, *, images: bool) -> dict[str, Any]:
     """See ``worlds.Env``."""
-    drive = functools.partial(
-      self.bullet.setJointMotorControlArray,
+    speed, count = (2 * action[6] - 1) * FINGER_SPEED, len(self._fingers)
+    self.bullet.setJointMotorControlArray(
       self._robot,
+      [*self._arm, *self._fingers],
       controlMode=pybullet.VELOCITY_CONTROL,
-    )
-    drive(self._arm, targetVelocities=action[:6].tolist(), forces=self._forces[:6])
-    speed = (2 * action[6] - 1) * FINGER_SPEED
-    count = len(self._fingers)
-    drive(
-      self._fingers, targetVelocities=[speed] * count, forces=self._forces[6:] * count
+      targetVelocities=[*action[:6].tolist(), *([speed] * count)],
+      forces=self._forces[:6] + self._forces[6:] * count,
     )
     for _ in range(SUBSTEPS):
       self.bullet.stepSimulation()
@@ -90,17 +80,15 @@ class BulletEnv:
     camera = model.camera(name).id
     pos, mat = self.pose(model.cam_bodyid[camera])
     eye = pos + mat @ model.cam_pos[camera]
-    axes = mat @ _matrix(model.cam_quat[camera])
-    picture = self.bullet.getCameraImage(
-      width,
-      height,
+    axes = mat @ _matrix(np.roll(model.cam_quat[camera], -1))
+    lens = (model.cam_fovy[camera], width / height, 0.01, 5.0)
+    matrices = (
       self.bullet.computeViewMatrix(eye, eye - axes[:, 2], axes[:, 1]),
-      self.bullet.computeProjectionMatrixFOV(
-        model.cam_fovy[camera], width / height, 0.01, 5.0
-      ),
-      renderer=pybullet.ER_TINY_RENDERER,
-      flags=pybullet.ER_NO_SEGMENTATION_MASK,
-    )[2]
+      self.bullet.computeProjectionMatrixFOV(*lens),
+    )
+    kind = {"renderer": pybullet.ER_TINY_RENDERER}
+    kind["flags"] = pybullet.ER_NO_SEGMENTATION_MASK
+    picture = self.bullet.getCameraImage(width, height, *matrices, **kind)[2]
     return np.reshape(picture, (height, width, 4))[..., :3].astype(np.uint8)
 
   def pose(self, body: int) -> tuple[np.ndarray, np.ndarray]:
@@ -114,7 +102,7 @@ class BulletEnv:
     else:
       state = self.bullet.getLinkState(bullet_body, link, computeForwardKinematics=True)
       pos, quat = state[4:6]
-    return np.array(pos), _matrix(np.roll(quat, 1))
+    return np.array(pos), _matrix(quat)
 
   def _load(self, root: int, path: Path) -> None:
     model = self.world.model
@@ -141,7 +129,7 @@ class BulletEnv:
     self.bullet.resetBaseVelocity(loaded, [0, 0, 0], [0, 0, 0])
 
 
-def build(settings: Mapping[str, Any]) -> sides.Built:
+def build(settings: sides.Settings) -> sides.Built:
   """Builds one world."""
   env = BulletEnv(worlds.load(settings["folder"]))
   about = {"api_version": pybullet.getAPIVersion()}
@@ -152,7 +140,6 @@ def _number(name: bytes) -> int:
   return int(name.decode().rsplit("_", 1)[1])
 
 
-def _matrix(quat: np.ndarray) -> np.ndarray:
-  mat = np.zeros(9)
-  mujoco.mju_quat2Mat(mat, np.asarray(quat, np.float64))
-  return mat.reshape(3, 3)
+def _matrix(quat: Sequence[float]) -> np.ndarray:
+  """Returns the rotation of a quaternion in PyBullet's order, f64[3, 3]."""
+  return np.reshape(pybullet.getMatrixFromQuaternion(quat), (3, 3))

@@ -5,8 +5,6 @@ and facts about it. Each side waits while the other one works, and a disturbance
 machine affects both.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 import contextlib
 import importlib
@@ -28,6 +26,7 @@ ROOT = Path(__file__).resolve().parents[2]
 Measure = Callable[[float], float]
 """Works for about so many seconds and returns a rate, 1/s."""
 
+Settings = Mapping[str, Any]
 Built = tuple[dict[str, Measure], dict[str, Any]]
 
 
@@ -48,28 +47,11 @@ def rate_of(run: Callable[[], Any], per_call: int) -> Measure:
   return measure
 
 
-def carried(step: Callable[[Any, int], Any], state: Any) -> Callable[[], None]:
-  """Returns a function that advances a state: (state, number of calls) -> state."""
-  calls = 0
-
-  def run() -> None:
-    nonlocal state, calls
-    state, calls = step(state, calls), calls + 1
-
-  return run
-
-
 class Side(contextlib.AbstractContextManager):
   """A running side; leaving the context ends all its processes."""
 
   def __init__(
-    self,
-    module: str,
-    settings: Mapping[str, Any],
-    *,
-    count: int = 1,
-    env: Mapping[str, str] | None = None,
-    limit_s: float,
+    self, module: str, settings: Settings, *, count: int = 1, limit_s: float, **env: str
   ):
     """Starts the processes and waits until they are ready.
 
@@ -77,24 +59,20 @@ class Side(contextlib.AbstractContextManager):
       module: of this folder.
       settings: what to build; each process also gets its number as "seed".
       count: processes, whose rates are added up.
-      env: environment variables in addition to those of this process.
       limit_s: longest time to become ready, and for each answer, s.
+      **env: environment variables in addition to those of this process.
+
+    Raises:
+      SideFailed: a process ended or stayed silent.
     """
-    self._limit_s, self._errors = limit_s, tempfile.TemporaryFile()
+    self._limit_s, self._errors = limit_s, tempfile.TemporaryFile("w+")
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     command = [sys.executable, "-m", "benchmarks.peers.sides", module]
-    self._processes = [
-      subprocess.Popen(
-        [*command, json.dumps({**settings, "seed": seed})],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=self._errors,
-        env=os.environ | {"PYTHONPATH": path} | dict(env or {}),
-        start_new_session=True,
-        text=True,
-      )
-      for seed in range(count)
-    ]
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    pipes |= {"stderr": self._errors, "text": True, "start_new_session": True}
+    pipes |= {"env": os.environ | {"PYTHONPATH": path} | env}
+    inputs = [json.dumps({**settings, "seed": seed}) for seed in range(count)]
+    self._processes = [subprocess.Popen([*command, x], **pipes) for x in inputs]
     try:
       self.about = self._answers()[0]
     except SideFailed:
@@ -118,24 +96,22 @@ class Side(contextlib.AbstractContextManager):
   def _answers(self) -> list[dict[str, Any]]:
     late = threading.Timer(self._limit_s, self._kill)
     late.start()
-    try:
-      return [self._answer(process) for process in self._processes]
-    finally:
-      late.cancel()
+    answers = list(map(self._answer, self._processes))  # Of all, even after an error.
+    late.cancel()
+    for answer in answers:
+      if "error" in answer:
+        raise SideFailed(answer["error"])
+    return answers
 
   def _answer(self, process: subprocess.Popen) -> dict[str, Any]:
     assert process.stdout is not None
     if line := process.stdout.readline():
-      answer = json.loads(line)
-    elif process.wait() == -signal.SIGKILL:
-      answer = {"error": f"no answer within {self._limit_s:.0f} s"}
-    else:
-      self._errors.seek(0)
-      lines = self._errors.read().decode(errors="replace").strip().splitlines()
-      answer = {"error": (lines or [f"exit code {process.returncode}"])[-1]}
-    if "error" in answer:
-      raise SideFailed(answer["error"])
-    return answer
+      return json.loads(line)
+    if process.wait() == -signal.SIGKILL:
+      return {"error": f"no answer within {self._limit_s:.0f} s"}
+    self._errors.seek(0)
+    lines = self._errors.read().strip().splitlines()
+    return {"error": lines[-1] if lines else f"exit code {process.returncode}"}
 
   def _kill(self) -> None:
     for process in self._processes:

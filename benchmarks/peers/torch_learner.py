@@ -6,17 +6,15 @@ first layer of Z is split. Distributions and convolutions are those of the libra
 Limits are plain clips, and the entropy of the prior is the mean of its components.
 """
 
-from __future__ import annotations
-
-from collections.abc import Mapping
+from collections.abc import Iterator
 import copy
 import dataclasses
+import itertools
 import math
-from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.distributions import Bernoulli, Categorical, MultivariateNormal
 import torch.nn.functional as F
 
@@ -24,18 +22,17 @@ from apnpql_jax.config import AgentConfig
 from apnpql_jax.presets import load_preset
 from benchmarks.peers import sides
 
-JOINTS, PRIMITIVES = 6, 3
+JOINTS, PRIMITIVES, ACTION = 6, 3, 7
 BELOW = JOINTS * (JOINTS - 1) // 2
-SHARPNESS, POSITION_SCALE = 4.0, 5.0
-"""Scales of keypoints and of the tool's position, as in our encoder."""
+SHARPNESS, STEP_SCALE, POSITION_SCALE = 4.0, 7.0, 5.0
+"""Scales of our encoder: of keypoints, changes of joints, and the tool's position."""
 IMAGES = {"global": (72, 96), "wrist": (36, 64)}
 
-Tensor = torch.Tensor
 Batch = dict[str, Tensor]
 
 
 class Camera(nn.Module):
-  """Two convolutions; returns the projection of their map, and their keypoints."""
+  """Two convolutions, with a projection of their map and keypoints as configured."""
 
   def __init__(self, config: AgentConfig, size: tuple[int, int], kept: str):
     super().__init__()
@@ -45,22 +42,17 @@ class Camera(nn.Module):
     self.first = nn.Conv2d(3, first, 4, stride=4)
     kernel = 3 if config.conv_overlap else 2
     self.second = nn.Conv2d(first, second, kernel, stride=2, padding=kernel // 3)
-    cells = height * width // 64
-    self.project = None
+    self.project, cells = None, height * width // 64
     if kept != "keypoints":
       self.project = nn.Linear(cells * second, config.feature_dim, bias=False)
     self.points = 0 if kept == "map" else 2 * (first + second)
 
-  def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-    """Maps u8[B, 3, H, W] to f32[B, feature_dim], zero without a map, and points."""
+  def forward(self, image: Tensor) -> tuple[Tensor | float, list[Tensor]]:
+    """Maps u8[B, 3, H, W] to f32[B, feature_dim] and keypoints f32[B, points]."""
     patches = self.first(F.pad(image.float() / 255.0, self.padding))
     x = self.second(F.relu(patches))
-    seen, points = x.new_zeros(()), x.new_zeros(len(x), 0)
-    if self.project is not None:
-      seen = self.project(F.relu(x).flatten(1))
-    if self.points:
-      points = torch.cat([keypoints(patches), keypoints(x)], -1)
-    return seen, points
+    seen = self.project(F.relu(x).flatten(1)) if self.project else 0.0
+    return seen, [keypoints(patches), keypoints(x)] if self.points else []
 
 
 class Encoder(nn.Module):
@@ -79,14 +71,13 @@ class Encoder(nn.Module):
   def forward(self, batch: Batch, time: str) -> Tensor:
     """Returns phi, f32[B, feature_dim]."""
     robot = batch[f"robot_{time}"].unflatten(-1, (3, 7))
-    newest, changes = robot[:, -1], 7.0 * (robot[:, 1:] - robot[:, :-1])
-    joints = newest[:, :JOINTS]
-    state = [newest, joints.sin(), joints.cos(), changes.flatten(1)]
-    state.append(POSITION_SCALE * batch[f"tool_{time}"])
+    newest, changes = robot[:, -1], STEP_SCALE * (robot[:, 1:] - robot[:, :-1])
+    joints, tool = newest[:, :JOINTS], POSITION_SCALE * batch[f"tool_{time}"]
+    state = [newest, joints.sin(), joints.cos(), changes.flatten(1), tool]
     seen = [camera(batch[f"{name}_{time}"]) for name, camera in self.cameras.items()]
     maps, points = zip(*seen, strict=True)
-    x = self.from_state(F.relu(self.state(torch.cat([*state, *points], -1))))
-    return F.relu(self.norm(x + sum(maps)))
+    x = self.state(torch.cat([*state, *itertools.chain(*points)], -1))
+    return F.relu(self.norm(self.from_state(F.relu(x)) + sum(maps)))
 
 
 class ValueHead(nn.Module):
@@ -94,10 +85,9 @@ class ValueHead(nn.Module):
 
   def __init__(self, config: AgentConfig):
     super().__init__()
-    width = config.hidden[0]
-    self.phi = nn.Linear(config.feature_dim, width)
-    self.action = nn.Linear(JOINTS + 1, width, bias=False)
-    self.rest = mlp([*config.hidden, config.num_atoms])
+    self.phi = nn.Linear(config.feature_dim, config.hidden[0])
+    self.action = nn.Linear(ACTION, config.hidden[0], bias=False)
+    self.rest = mlp(*config.hidden, config.num_atoms)
 
   def forward(self, phi: Tensor, actions: Tensor) -> Tensor:
     """Maps f32[B, n], f32[S, B, 7] to f32[S, B, atoms]."""
@@ -129,7 +119,7 @@ class Prior:
     arm, close = self.arm.sample((count,)), self.gripper.sample((count,))
     draws = torch.cat([arm, close[..., None]], -1)
     component = Categorical(logits=self.logits).sample((count,))
-    index = component[..., None, None].expand(*component.shape, 1, JOINTS + 1)
+    index = component[..., None, None].expand(*component.shape, 1, ACTION)
     return draws.gather(-2, index)[..., 0, :]
 
   def log_prob(self, actions: Tensor) -> Tensor:
@@ -152,22 +142,23 @@ class Networks(nn.Module):
     if config.algorithm != "ap_npql":
       raise ValueError("only ap_npql is written in PyTorch")
     self.config = config
-    widths = [config.feature_dim, *config.hidden]
-    self.encoder = Encoder(config)
-    self.ap = mlp([*widths, PRIMITIVES * (JOINTS + 1)])
-    self.bp = mlp([*widths, PRIMITIVES * (JOINTS + BELOW + 2)])
-    self.z = ValueHead(config)
-    self.alpha = mlp([*widths, 1])
+    widths = (config.feature_dim, *config.hidden)
+    self.encoder, self.z = Encoder(config), ValueHead(config)
+    self.ap = mlp(*widths, PRIMITIVES * ACTION)
+    self.bp = mlp(*widths, PRIMITIVES * (JOINTS + BELOW + 2))
+    self.alpha = mlp(*widths, 1)
+    atoms = torch.linspace(config.v_min, config.v_max, config.num_atoms)
+    self.register_buffer("atoms", atoms)
 
   def temperature(self, phi: Tensor) -> Tensor:
     """Returns alpha, f32[B]."""
-    offset = math.log(math.expm1(self.config.initial_alpha))
     raw = self.alpha(phi.detach())[..., 0]
+    offset = math.log(math.expm1(self.config.initial_alpha))
     return F.softplus(raw + offset) + self.config.min_alpha
 
   def primitives(self, phi: Tensor) -> Tensor:
     """Returns the predicted primitives, f32[B, 3, 7]."""
-    return self.ap(phi).unflatten(-1, (PRIMITIVES, JOINTS + 1))
+    return self.ap(phi).unflatten(-1, (PRIMITIVES, ACTION))
 
   def prior(self, phi: Tensor) -> Prior:
     """Returns b at the states; its gradient reaches ``bp`` alone."""
@@ -175,25 +166,21 @@ class Networks(nn.Module):
     return Prior(raw, self.primitives(phi).detach(), self.config)
 
   @torch.no_grad()
-  def improved(self, phi: Tensor, count: int, atoms: Tensor) -> tuple[Tensor, ...]:
+  def improved(self, phi: Tensor, count: int) -> tuple[Tensor, ...]:
     """Returns candidates of q, their return distributions, values and weights."""
     samples = self.prior(phi).sample(count)
     probs = F.softmax(self.z(phi, samples.clamp(-1.0, 1.0)), -1)
-    values = probs @ atoms
-    weights = F.softmax(values / self.temperature(phi), 0)
-    return samples, probs, values, weights
+    values = probs @ self.atoms
+    return samples, probs, values, F.softmax(values / self.temperature(phi), 0)
 
 
 class Learner:
   """Algorithm 1: one update per call of ``update``."""
 
   def __init__(self, config: AgentConfig, device: str):
-    self.config = config
-    self.online = Networks(config).to(device)
+    self.config, self.online = config, Networks(config).to(device)
     self.target = copy.deepcopy(self.online).requires_grad_(False)
     self.nu = torch.zeros((), device=device, requires_grad=True)
-    span = (config.v_min, config.v_max, config.num_atoms)
-    self.atoms = torch.linspace(*span, device=device)
     net = self.online
     groups = {
       "e": [*net.encoder.parameters(), *net.ap.parameters(), *net.z.parameters()],
@@ -209,21 +196,7 @@ class Learner:
   def update(self, batch: Batch) -> float:
     """Takes one update and returns the sum of the losses."""
     config, net = self.config, self.online
-    goal = self._target(batch)
-    phi = net.encoder(batch, "tm1")
-    logits = net.z(phi, batch["action"][None])[0]
-    samples, _, values, weights = net.improved(phi, config.policy_samples, self.atoms)
-    prior, alpha = net.prior(phi), net.temperature(phi)
-    log_mean = torch.logsumexp(values / alpha, 0) - math.log(config.policy_samples)
-    entropy = prior.entropy()
-    loss = (
-      config.lambda_ap * ap_loss(net.primitives(phi), batch["primitives"], config)
-      - (goal * F.log_softmax(logits, -1)).sum(-1).mean()
-      - (weights * prior.log_prob(samples)).sum(0).mean()
-      - (self.nu.detach() * entropy).mean()
-      + (alpha * (config.epsilon + log_mean)).mean()
-      + self.nu * (entropy.detach() - config.epsilon_nu).mean()
-    )
+    loss = sum(self._losses(batch))
     for optimizer in self.optimizers:
       optimizer.zero_grad()
     loss.backward()
@@ -237,44 +210,53 @@ class Learner:
         old.lerp_(new, config.target_rate)
     return loss.item()
 
+  def _losses(self, batch: Batch) -> Iterator[Tensor]:
+    config, net = self.config, self.online
+    phi = net.encoder(batch, "tm1")
+    predicted, label = net.primitives(phi), batch["primitives"]
+    arm = (predicted[..., :-1], label[..., :-1])
+    close = (predicted[..., -1], label[..., -1])
+    yield config.lambda_ap * F.huber_loss(*arm, delta=config.ap_delta) / config.ap_delta
+    yield config.lambda_ap * F.binary_cross_entropy_with_logits(*close)
+    logits = net.z(phi, batch["action"][None])[0]
+    yield -(self._target(batch) * F.log_softmax(logits, -1)).sum(-1).mean()
+    samples, _, values, weights = net.improved(phi, config.policy_samples)
+    prior, alpha = net.prior(phi), net.temperature(phi)
+    entropy = prior.entropy()
+    yield -(weights * prior.log_prob(samples)).sum(0).mean()
+    yield -(self.nu.detach() * entropy).mean()
+    yield self.nu * (entropy.detach() - config.epsilon_nu).mean()
+    log_mean = torch.logsumexp(values / alpha, 0) - math.log(config.policy_samples)
+    yield (alpha * (config.epsilon + log_mean)).mean()
+
   @torch.no_grad()
   def _target(self, batch: Batch) -> Tensor:
     """Returns the projected distributional target, f32[B, atoms]."""
-    phi = self.target.encoder(batch, "t")
-    count = self.config.target_samples
-    _, probs, _, weights = self.target.improved(phi, count, self.atoms)
+    config, net = self.config, self.target
+    phi = net.encoder(batch, "t")
+    _, probs, _, weights = net.improved(phi, config.target_samples)
     probs = (weights[..., None] * probs).sum(0)
-    low, high = self.config.v_min, self.config.v_max
-    moved = batch["reward"][:, None] + batch["discount"][:, None] * self.atoms
-    place = (moved.clamp(low, high) - low) / (high - low) * (len(self.atoms) - 1)
-    lower = place.floor().clamp(max=len(self.atoms) - 2)
-    share = place - lower
-    index = lower.long()
+    moved = batch["reward"][:, None] + batch["discount"][:, None] * net.atoms
+    low, high, steps = config.v_min, config.v_max, config.num_atoms - 1
+    place = (moved.clamp(low, high) - low) / (high - low) * steps
+    lower = place.floor().clamp(max=steps - 1)
+    share, index = place - lower, lower.long()
     goal = torch.zeros_like(probs).scatter_add_(-1, index, probs * (1.0 - share))
     return goal.scatter_add_(-1, index + 1, probs * share)
 
 
 def keypoints(scores: Tensor) -> Tensor:
   """Returns the soft-argmax of each channel in [-1, 1]; f32[B, C, H, W] -> [B, 2 C]."""
-  height, width = scores.shape[-2:]
-  share = F.softmax(SHARPNESS * scores.flatten(2), -1).unflatten(-1, (height, width))
-  half = [(torch.arange(n, device=scores.device) + 0.5) / n for n in (height, width)]
-  rows, columns = (2 * places - 1 for places in half)
+  size = scores.shape[-2:]
+  share = F.softmax(SHARPNESS * scores.flatten(2), -1).unflatten(-1, size)
+  rows, columns = ((2 * torch.arange(n).to(share.device) + 1) / n - 1 for n in size)
   return torch.stack([share.sum(-1) @ rows, share.sum(-2) @ columns], -1).flatten(1)
 
 
-def ap_loss(predicted: Tensor, label: Tensor, config: AgentConfig) -> Tensor:
-  """Returns the behavior cloning loss of the primitives."""
-  delta = config.ap_delta
-  huber = F.huber_loss(predicted[..., :-1], label[..., :-1], delta=delta) / delta
-  command = F.binary_cross_entropy_with_logits(predicted[..., -1], label[..., -1])
-  return huber + command
-
-
-def mlp(widths: list[int]) -> nn.Sequential:
+def mlp(*widths: int) -> nn.Sequential:
   """Returns linear layers with relu between them."""
   layers: list[nn.Module] = []
-  for before, after in zip(widths, widths[1:], strict=False):
+  for before, after in itertools.pairwise(widths):
     layers += [nn.Linear(before, after), nn.ReLU()]
   return nn.Sequential(*layers[:-1])
 
@@ -282,24 +264,20 @@ def mlp(widths: list[int]) -> nn.Sequential:
 def random_batch(count: int, device: str) -> Batch:
   """Draws noise in the shapes of a batch."""
   rng = np.random.default_rng(0)
-  batch: dict[str, np.ndarray] = {
-    "action": rng.uniform(-1, 1, (count, 7)),
-    "reward": rng.integers(0, 2, count),
-    "discount": np.full(count, 0.97),
-    "primitives": rng.uniform(0, 1, (count, PRIMITIVES, 7)),
-  }
+  shapes: dict[str, tuple[int, ...]] = {"action": (ACTION,), "reward": ()}
+  shapes |= {"discount": (), "primitives": (PRIMITIVES, ACTION)}
+  batch: Batch = {}
   for time in ("tm1", "t"):
-    batch[f"robot_{time}"] = rng.normal(size=(count, 21))
-    batch[f"tool_{time}"] = rng.normal(size=(count, 3))
+    shapes |= {f"robot_{time}": (21,), f"tool_{time}": (3,)}
     for name, size in IMAGES.items():
-      batch[f"{name}_{time}"] = rng.integers(0, 256, (count, 3, *size), np.uint8)
-  return {
-    name: torch.as_tensor(x if x.dtype == np.uint8 else x.astype(np.float32)).to(device)
-    for name, x in batch.items()
-  }
+      image = rng.integers(0, 256, (count, 3, *size), np.uint8)
+      batch[f"{name}_{time}"] = torch.as_tensor(image, device=device)
+  for name, shape in shapes.items():
+    batch[name] = torch.rand((count, *shape), device=device)
+  return batch
 
 
-def build(settings: Mapping[str, Any]) -> sides.Built:
+def build(settings: sides.Settings) -> sides.Built:
   """Builds the learner of a preset."""
   device = "cuda" if torch.cuda.is_available() else "cpu"
   count = settings["candidates"]

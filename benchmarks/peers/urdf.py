@@ -5,19 +5,15 @@ them for contact, of collisions. Armature, equalities, actuators and contact par
 are left out, because URDF cannot express them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
-import math
+import warnings
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-PLANE_HALF = 2.0
-"""m; a plane becomes the upper side of a box of this half size."""
-
-_FREE = mujoco.mjtJoint.mjJNT_FREE
-_HINGE = mujoco.mjtJoint.mjJNT_HINGE
+PLANE = np.array([2.0, 2.0, 0.05])
+"""Half sizes of the box whose upper side stands for a plane, m."""
 
 
 def roots(model: mujoco.MjModel) -> list[int]:
@@ -67,22 +63,19 @@ def _shapes(model: mujoco.MjModel, body: int) -> Iterator[str]:
 
 
 def _shape(model: mujoco.MjModel, geom: int) -> str:
-  kinds, kind = mujoco.mjtGeom, mujoco.mjtGeom(model.geom_type[geom])
+  kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
   size, pos = model.geom_size[geom], model.geom_pos[geom]
-  if kind == kinds.mjGEOM_PLANE:
-    depth = 0.1
-    inside = f'<box size="{2 * PLANE_HALF} {2 * PLANE_HALF} {depth}"/>'
-    pos = pos - [0.0, 0.0, depth / 2]
-  elif kind == kinds.mjGEOM_SPHERE:
-    inside = f'<sphere radius="{size[0]}"/>'
-  elif kind == kinds.mjGEOM_BOX:
-    inside = f'<box size="{_numbers(2 * size)}"/>'
-  elif kind in (kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER):
-    name = "capsule" if kind == kinds.mjGEOM_CAPSULE else "cylinder"
-    inside = f'<{name} radius="{size[0]}" length="{2 * size[1]}"/>'
-  else:
-    raise ValueError(f"no URDF for a geom of type {kind.name}")
-  return f"{_origin(pos, model.geom_quat[geom])}<geometry>{inside}</geometry>"
+  if kind == "plane":
+    kind, size, pos = "box", PLANE, pos - PLANE * [0, 0, 1]
+  shapes = {
+    "sphere": f'<sphere radius="{size[0]}"/>',
+    "box": f'<box size="{_numbers(2 * size)}"/>',
+    "capsule": f'<capsule radius="{size[0]}" length="{2 * size[1]}"/>',
+    "cylinder": f'<cylinder radius="{size[0]}" length="{2 * size[1]}"/>',
+  }
+  if kind not in shapes:
+    raise ValueError(f"no URDF for a geom of type {kind}")
+  return f"{_origin(pos, model.geom_quat[geom])}<geometry>{shapes[kind]}</geometry>"
 
 
 def _joint(model: mujoco.MjModel, body: int) -> str:
@@ -93,7 +86,8 @@ def _joint(model: mujoco.MjModel, body: int) -> str:
   joint, count = model.body_jntadr[body], model.body_jntnum[body]
   if not count:
     return f'<joint name="fixed_{body}" type="fixed">{frame}</joint>'
-  if count > 1 or model.jnt_type[joint] != _HINGE or model.jnt_pos[joint].any():
+  hinge = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
+  if count > 1 or not hinge or model.jnt_pos[joint].any():
     raise ValueError(f"body {body} does not turn about one axis through its origin")
   low, high = model.jnt_range[joint]
   return (
@@ -106,20 +100,13 @@ def _joint(model: mujoco.MjModel, body: int) -> str:
 def is_free(model: mujoco.MjModel, body: int) -> bool:
   """Returns whether a body floats."""
   joint = model.body_jntadr[body]
-  return bool(joint >= 0 and model.jnt_type[joint] == _FREE)
+  return bool(joint >= 0 and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE)
 
 
 def _origin(pos: np.ndarray, quat: np.ndarray) -> str:
-  mat = np.zeros(9)
-  mujoco.mju_quat2Mat(mat, quat)
-  (m00, _, _), (m10, m11, m12), (m20, m21, m22) = mat.reshape(3, 3)
-  level = math.hypot(m00, m10)
-  pitch = math.atan2(-m20, level)
-  # Straight up or down, roll and yaw turn about the same axis; roll is enough.
-  steep = level < 1e-9
-  roll = math.atan2(-m12, m11) if steep else math.atan2(m21, m22)
-  yaw = 0.0 if steep else math.atan2(m10, m00)
-  return f'<origin xyz="{_numbers(pos)}" rpy="{roll} {pitch} {yaw}"/>'
+  with warnings.catch_warnings(action="ignore"):  # Of pitches of 90 degrees.
+    rpy = Rotation.from_quat(quat, scalar_first=True).as_euler("xyz")
+  return f'<origin xyz="{_numbers(pos)}" rpy="{_numbers(rpy)}"/>'
 
 
 def _numbers(values: np.ndarray) -> str:

@@ -3,8 +3,6 @@
 A scene is passed on as a file, so that a process need not import JAX.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 import dataclasses
 import functools
@@ -19,6 +17,7 @@ from benchmarks.peers import sides
 CONTROL_PERIOD_S = 0.15
 EPISODE_STEPS = 93
 RESETS = 64
+STATES = ("qpos", "mocap_pos", "mocap_quat")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,14 +42,11 @@ class Env(Protocol):
 
   def reset(self, row: int) -> None:
     """Starts from a row of the world's resets."""
-    ...
 
   def step(self, action: np.ndarray, *, images: bool) -> dict[str, Any]:
-    """Steps one control period and returns the observation.
+    """Steps one control period and returns the observation, with images if asked for.
 
-    Args:
-      action: f64[7], six joint velocities in rad/s, and 1 to close the gripper.
-      images: whether to include the images.
+    ``action`` is f64[7], six joint velocities in rad/s, and 1 to close the gripper.
     """
     ...
 
@@ -60,13 +56,7 @@ class Env(Protocol):
 
 
 def export(task_name: str, sizes: Mapping[str, Any] | None, folder: Path) -> None:
-  """Writes a task's scene and some of its resets.
-
-  Args:
-    task_name: the task.
-    sizes: height and width of the images by camera; the default ones if None.
-    folder: where to.
-  """
+  """Writes a task's scene and resets; ``sizes`` are those of the images, by camera."""
   from apnpql_jax.config import EnvConfig
   from apnpql_jax.tasks import make_task
 
@@ -74,24 +64,18 @@ def export(task_name: str, sizes: Mapping[str, Any] | None, folder: Path) -> Non
   sizes = sizes or {"global": config.global_size, "wrist": config.wrist_size}
   mujoco.mj_saveModel(task.scene.model, str(folder / "model.mjb"), None)
   draw = task.sample_resets(np.random.default_rng(0), 8 * RESETS)
-  qpos, mocap_pos, mocap_quat, variant = map(np.asarray, draw)
   # The file holds one variant of the scene, so the others are left out.
-  rows = np.flatnonzero(variant == 0)[:RESETS]
-  np.savez(
-    folder / "resets.npz",
-    qpos=qpos[rows],
-    mocap_pos=mocap_pos[rows],
-    mocap_quat=mocap_quat[rows],
-    cameras=list(sizes),
-    sizes=list(sizes.values()),
-  )
+  rows = np.flatnonzero(np.asarray(draw.variant) == 0)[:RESETS]
+  arrays: dict[str, Any] = {k: np.asarray(getattr(draw, k))[rows] for k in STATES}
+  arrays |= {"cameras": list(sizes), "sizes": list(sizes.values())}
+  np.savez(folder / "resets.npz", **arrays)
 
 
 def load(folder: str | Path) -> World:
   """Reads the files of ``export``."""
   model = mujoco.MjModel.from_binary_path(str(Path(folder) / "model.mjb"))
   with np.load(Path(folder) / "resets.npz") as stored:
-    states = [stored[name] for name in ("qpos", "mocap_pos", "mocap_quat")]
+    states = [stored[name] for name in STATES]
     sizes = zip(stored["cameras"].tolist(), stored["sizes"].tolist(), strict=True)
     return World(model, *states, {name: (size[0], size[1]) for name, size in sizes})
 

@@ -1,14 +1,11 @@
 """The ray caster against MuJoCo's renderer on random states of every scene.
 
-  python -m benchmarks.quality.fidelity --quick
   python -m benchmarks.quality.fidelity --store
 
 Compares segmentation and depth of both cameras. ``--store`` also writes the worst image
 of every scene to docs/images/fidelity.png: our image, our segmentation, MuJoCo's, and
 their difference. Where MuJoCo cannot draw, its rays replace its rasterizer.
 """
-
-from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Any
@@ -24,15 +21,12 @@ from benchmarks.common import command, store
 from tests import render_oracles
 
 CAMERAS = {"global": EnvConfig().global_size, "wrist": EnvConfig().wrist_size}
-SEEN = 20
-"""Pixels from which an object counts for the mean overlap."""
-SCALE = 3
-"""Enlargement of the images in the picture."""
+SEEN, SCALE = 20, 3
+"""Pixels from which an object counts for the overlaps; enlargement of the picture."""
 PICTURE = store.ROOT / "docs" / "images" / "fidelity.png"
 
 
 def main() -> None:
-  """Runs the command line; see the module's docstring."""
   parser = command.parser(__doc__)
   parser.add_argument("--states", type=int, default=32, help="of each scene")
   args = command.parse(parser)
@@ -44,22 +38,19 @@ def main() -> None:
     iio.imwrite(PICTURE, np.concatenate(pictures))
 
 
-def measure_all(
-  oracle: str, count: int, pictures: list[np.ndarray]
-) -> Iterator[dict[str, Any]]:
+def measure_all(oracle: str, count: int, pictures: list) -> Iterator[dict[str, Any]]:
   """Yields the figures of each scene and camera; adds to the pictures."""
   for name in task_names():
     task = make_task(name)
     model, states = task.scene.model, draw_states(task, count)
+    labels = label(model)
     for camera, size in CAMERAS.items():
       ours = our_view(model, states, camera, size)
       ids, depth = render_oracles.look(oracle, model, states, camera, *size)
-      labels = label(model)
       ours, ids = ours.replace(segmentation=labels[ours.segmentation]), labels[ids]
-      figures, worst = compare(ours, ids, depth)
-      yield {"scene": name, "camera": camera, **figures}
+      yield {"scene": name, "camera": camera, **compare(ours, ids, depth)}
       if camera == "global":
-        pictures.append(picture(ours, ids, worst))
+        pictures.append(picture(ours, ids))
 
 
 def draw_states(task: Task, count: int) -> np.ndarray:
@@ -77,69 +68,55 @@ def draw_states(task: Task, count: int) -> np.ndarray:
   return np.stack(states)
 
 
-def our_view(
-  model: mujoco.MjModel, states: np.ndarray, name: str, size: tuple[int, int]
-) -> Image:
+def our_view(model: Any, states: np.ndarray, name: str, size: tuple[int, int]) -> Image:
   """Renders the states with the ray caster, as NumPy arrays."""
   data, poses = mujoco.MjData(model), []
   spec = CameraSpec.from_model(model, name, height=size[0], width=size[1])
   for state in states:
     mujoco.mj_setState(model, data, state, render_oracles.STATE)
     mujoco.mj_forward(model, data)
-    arrays = (
-      data.geom_xpos,
-      data.geom_xmat.reshape(-1, 3, 3),
-      data.cam_xpos[spec.id],
-      data.cam_xmat[spec.id].reshape(3, 3),
-    )
-    poses.append([np.array(array, np.float32) for array in arrays])
+    geoms = (data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3))
+    camera = (data.cam_xpos[spec.id], data.cam_xmat[spec.id].reshape(3, 3))
+    poses.append([np.array(array, np.float32) for array in (*geoms, *camera)])
   batch = [np.stack(parts) for parts in zip(*poses, strict=True)]
   image = render(Geoms.from_model(model), spec, *batch, Lighting.from_model(model))
   return Image(*map(np.asarray, (image.rgb, image.depth, image.segmentation)))
 
 
 def label(model: mujoco.MjModel) -> np.ndarray:
-  """Labels geoms, i[ngeom + 1]; the last label is -1, for nothing.
-
-  Geoms of one body and color share a label: the boxes of a cup share their tops, where
-  any of them may be drawn.
-  """
+  """Labels geoms, i[ngeom + 1], by body and color: the boxes of a cup share their tops,
+  where any of them may be drawn. The last label is -1, for nothing."""
   things = np.column_stack([model.geom_bodyid, model.geom_rgba])
   return np.append(np.unique(things, axis=0, return_inverse=True)[1], -1)
 
 
-def compare(
-  ours: Image, ids: np.ndarray, depth: np.ndarray
-) -> tuple[dict[str, Any], int]:
-  """Returns the figures of a camera and the index of the worst image."""
-  seen = np.asarray(ours.segmentation)
-  same = seen == ids
-  overlaps = []
+def compare(ours: Image, ids: np.ndarray, depth: np.ndarray) -> dict[str, float]:
+  """Returns the figures of a camera."""
+  seen, overlaps = np.asarray(ours.segmentation), []
   for view, truth in zip(seen, ids, strict=True):
     for thing in np.unique(truth):
       here, there = view == thing, truth == thing
       if there.sum() >= SEEN:
         overlaps.append((here & there).sum() / (here | there).sum())
-  both = same & (ids >= 0)
-  error = 1e6 * np.abs(np.asarray(ours.depth)[both] - depth[both])
-  figures = {
-    "agreeing": float(same.mean()),
+  both = (seen == ids) & (ids >= 0)
+  error_um = 1e6 * np.abs(np.asarray(ours.depth)[both] - depth[both])
+  return {
+    "agreeing": float((seen == ids).mean()),
     "iou_mean": float(np.mean(overlaps)),
     "iou_least": float(np.min(overlaps)),
-    "depth_median_um": float(np.median(error)),
-    "depth_p99_um": float(np.quantile(error, 0.99)),
+    "depth_median_um": float(np.median(error_um)),
+    "depth_p99_um": float(np.quantile(error_um, 0.99)),
   }
-  return figures, int(same.mean((1, 2)).argmin())
 
 
-def picture(ours: Image, ids: np.ndarray, index: int) -> np.ndarray:
-  """Returns four views of one state side by side, u8[H, W, 3]."""
-  seen = np.asarray(ours.segmentation)[index]
+def picture(ours: Image, ids: np.ndarray) -> np.ndarray:
+  """Returns four views of the worst state side by side, u8[H, W, 3]."""
+  seen = np.asarray(ours.segmentation)
+  worst = (seen == ids).mean((1, 2)).argmin()
   colors = np.random.default_rng(1).integers(40, 256, (ids.max() + 2, 3)).astype("u1")
-  wrong = np.where((seen != ids[index])[..., None], np.uint8(255), np.uint8(0))
-  views = (np.asarray(ours.rgb)[index], colors[seen], colors[ids[index]])
-  row = np.concatenate([*views, np.repeat(wrong, 3, axis=-1)], axis=1)
-  return row.repeat(SCALE, axis=0).repeat(SCALE, axis=1)
+  wrong = np.where((seen != ids)[worst][..., None], [255] * 3, 0).astype("u1")
+  views = (np.asarray(ours.rgb)[worst], colors[seen[worst]], colors[ids[worst]], wrong)
+  return np.concatenate(views, axis=1).repeat(SCALE, axis=0).repeat(SCALE, axis=1)
 
 
 if __name__ == "__main__":

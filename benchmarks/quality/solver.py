@@ -9,8 +9,6 @@ plays held-out episodes on one engine, and the speed of the scene is measured. R
 are added to results/solver.json and replace those of the same task, engine and setting.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json
@@ -29,7 +27,6 @@ SETTINGS = ["20x20", "10x10", "5x10", "5x5", "3x10", "10x10x999", "10x10x16", "1
 
 
 def main() -> None:
-  """Runs the command line; see the module's docstring."""
   parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
   parser.add_argument("--tasks", nargs="+", choices=task_names(), default=task_names())
   parser.add_argument("--backend", choices=settings.ENGINES, default="mjx")

@@ -7,8 +7,6 @@ Writes results/tasks/<task>-<backend>.json, and from all files there the tables 
 docs/tasks.md; also docs/tasks/<task>.png and .mp4.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path
@@ -34,14 +32,12 @@ RESULTS = store.RESULTS / "tasks"
 DOC = store.ROOT / "docs" / "tasks.md"
 INSTANTS, MARGIN = 4, 6
 """Instants of an episode in a picture, and white pixels around each."""
-EXPERTS = (
-  "task|backend|solved|rate (95 %)|periods|pairs|contact slots|rows|physics steps/s"
-)
+EXPERTS = "task|backend|solved|rate (95 %)|periods|pairs|contact slots|rows"
+EXPERTS += "|physics steps/s"
 BANKS = "bank of resets|rows|draws rejected|residual of mink|built in|loaded in"
 
 
 def main() -> None:
-  """Runs the command line; see the module's docstring."""
   parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
   parser.add_argument("--tasks", nargs="+", choices=task_names(), default=task_names())
   engines = settings.ENGINES
@@ -51,11 +47,10 @@ def main() -> None:
   args = parser.parse_args()
   runtime.configure()
   # Speeds first: episodes take hours, and the machine will not stay idle.
-  reports = {
-    name: contact_report(make_task(name), backends=args.backends) for name in args.tasks
-  }
+  engines = args.backends
+  reports = {k: contact_report(make_task(k), backends=engines) for k in args.tasks}
   for name, report in reports.items():
-    for backend in args.backends:
+    for backend in engines:
       config = EnvConfig(task=name, backend=backend, obs="state")
       measured = measure(config, report, args.episodes, args.seed)
       store.store(f"tasks/{name}-{backend}", measured)

@@ -7,8 +7,6 @@ from there. The runs are tiny, but compiled as any run is. All arrays of the two
 training states are compared. On a CPU they must be the same bits.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path
@@ -49,40 +47,29 @@ def main() -> int:
 
 
 def train(run: Path, *args: str) -> None:
-  """Trains to the end in a new process.
-
-  Raises:
-    RuntimeError: the process failed; with its last output.
-  """
+  """Trains to the end in a new process; raises its output if it fails."""
   output = run.parent / "output"
   if tiny.start(run, *args, said=output, xla_flags="").wait():
     raise RuntimeError(output.read_text()[-2000:])
 
 
 def compare(a: Arrays, b: Arrays) -> dict[str, Any]:
-  """Counts the arrays that are the same bits, and returns how much others differ.
-
-  The difference of an array is its largest one, divided by the array's largest number.
+  """Counts the arrays that are the same bits, and returns how much others differ: the
+  largest difference divided by the array's largest number.
 
   Raises:
     ValueError: the states have different arrays.
   """
   if a.keys() != b.keys():
     raise ValueError(f"only one state has {sorted(a.keys() ^ b.keys())}")
-  others = [name for name in a if a[name].tobytes() != b[name].tobytes()]
-  differ = {
-    name: _share(a[name].astype(float), b[name].astype(float)) for name in others
-  }
-  most = sorted(differ.items(), key=lambda pair: -pair[1])
-  return {
-    "arrays": len(a),
-    "same_bits": len(a) - len(differ),
-    "differ": dict(most[:10]),
-  }
-
-
-def _share(a: np.ndarray, b: np.ndarray) -> float:
-  return float(np.abs(a - b).max() / max(np.abs(a).max(), np.finfo(float).tiny))
+  differ = {}
+  for name in a:
+    if a[name].tobytes() != b[name].tobytes():
+      x, y = a[name].astype(float), b[name].astype(float)
+      most = max(np.abs(x).max(), np.finfo(float).tiny)
+      differ[name] = float(np.abs(x - y).max() / most)
+  largest = dict(sorted(differ.items(), key=lambda pair: -pair[1])[:10])
+  return {"arrays": len(a), "same_bits": len(a) - len(differ), "differ": largest}
 
 
 if __name__ == "__main__":

@@ -10,8 +10,6 @@ put into checkpoints of copies of the disturbed run. Writes results/soak.json an
 results/soak.log.
 """
 
-from __future__ import annotations
-
 import argparse
 import collections
 from collections.abc import Callable
@@ -28,20 +26,22 @@ import tempfile
 import time
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax import checkpoint, runs, runtime
+from apnpql_jax import checkpoint, resuming, runs, runtime
+from apnpql_jax.agents.learner import make_agent
+from apnpql_jax.checkpoint_writer import CheckpointWriter
+from apnpql_jax.env import make_env
+from apnpql_jax.iteration import example_state
 from benchmarks import tiny
 from benchmarks.common import store
-from benchmarks.reliability import damage
 
 INTERVAL = 512
 """Environment steps between two checkpoints."""
 
-OPTIONS = (
-  f"--replay.capacity 4096 --replay.expert-steps 512 --checkpoint-every {INTERVAL}"
-)
-OPTIONS += f" --eval-every {64 * INTERVAL}"
+OPTIONS = f"--checkpoint-every {INTERVAL} --eval-every {64 * INTERVAL}".split()
+OPTIONS += "--replay.capacity 4096 --replay.expert-steps 512".split()
 ENDLESS = ["--total-steps", "2000000000"]
 PATIENCE_S = 600
 Process = subprocess.Popen[bytes]
@@ -60,7 +60,7 @@ class Trial:
   def start(self, run: Path, *args: str) -> Process:
     """Trains in a new process, whose output replaces that of the previous one."""
     self._output.write_text("")
-    return tiny.start(run, *OPTIONS.split(), *(args or ENDLESS), said=self._output)
+    return tiny.start(run, *OPTIONS, *(args or ENDLESS), said=self._output)
 
   def disturb(self, fault: str) -> Row:
     """Trains for some seconds, causes a fault, and returns its consequences."""
@@ -69,7 +69,7 @@ class Trial:
     if fault.startswith("poisoned"):
       target = run.with_name("poisoned")
       shutil.copytree(run, target)
-      damage.poison(target, rewards=fault.endswith("rewards"))
+      poison(target, rewards=fault.endswith("rewards"))
     process = self.start(target)
     self.wait(process)
     code = self._end(process, fault)
@@ -77,13 +77,13 @@ class Trial:
     if target is run:
       row["lost"] = row["to"] - (checkpoint.latest_step(run) or 0)
       if fault == "bit flip" and len(checkpoint.all_steps(run)) > 1:
-        row["file"] = damage.flip_a_bit(run, self._rng)
+        row["file"] = flip_a_bit(run, self._rng)
     else:
       faults = [r for r in tiny.rows(target) if r["step"] > before]
       for name in ("faults/worlds", "faults/updates"):
         row[name] = sum(r.get(name) or 0 for r in faults)
       if dumps := list(target.glob("faults/*.npz")):
-        row["repeated"] = _repeat(dumps[0])
+        row["repeated"] = repeat(dumps[0])
       shutil.rmtree(target)
     return row
 
@@ -183,10 +183,8 @@ def same_bits(trials: list[Trial], total: int, patience_s: float) -> bool:
 
 
 def same_metrics(*runs: Path) -> bool:
-  """Returns whether every run has each iteration once, with the same loss in all.
-
-  Runs may differ in length; they are compared up to the end of the shortest.
-  """
+  """Returns whether every run has each iteration once, and all have the same losses up
+  to the end of the shortest."""
   losses = []
   for run in runs:
     rows = [row for row in tiny.rows(run) if "loss/q" in row]
@@ -251,7 +249,43 @@ def soak(folder: Path, minutes: float, rng: random.Random) -> tuple[Row, list[Ro
   return result | {"as_promised": kept}, events
 
 
-def _repeat(dump: Path) -> str:
+def poison(run: Path, *, rewards: bool) -> None:
+  """Puts NaN into all rewards of both replays, or into the velocity of one world, and
+  saves that as the only checkpoint of a run."""
+  config = runs.load_run_config(run)
+  env, agent = make_env(config.env), make_agent(config.agent)
+  example = example_state(config, env, agent)
+  state = resuming.restore(config, run, example, lambda line: None)
+  if rewards:
+    rings = {name: getattr(state, name) for name in ("replay", "expert_replay")}
+    state = state.replace(**{name: _no_rewards(x) for name, x in rings.items()})
+  else:
+    physics = state.env.physics
+    physics = physics.replace(qvel=physics.qvel.at[1, 0].set(jnp.nan))
+    state = state.replace(env=state.env.replace(physics=physics))
+  shutil.rmtree(run / "checkpoints")
+  with CheckpointWriter(run, config, keep=1) as writer:
+    writer.save(int(state.env_steps), resuming.to_items(state, whole=True))
+
+
+def flip_a_bit(run: Path, rng: random.Random) -> str:
+  """Flips a bit in the largest file of the newest checkpoint; returns its name."""
+  folder = run / "checkpoints" / str(checkpoint.latest_step(run))
+  files = [path for path in folder.rglob("*") if path.is_file()]
+  file = max(files, key=lambda path: path.stat().st_size)
+  data = bytearray(file.read_bytes())
+  data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+  file.write_bytes(data)
+  return str(file.relative_to(run))
+
+
+def _no_rewards(ring: Any) -> Any:
+  timestep = ring.slots.timestep
+  timestep = timestep.replace(reward=timestep.reward * jnp.nan)
+  return ring.replace(slots=ring.slots.replace(timestep=timestep))
+
+
+def repeat(dump: Path) -> str:
   """Returns the output of ``apnpql repeat`` for a dumped update."""
   command = [sys.executable, "-m", "apnpql_jax", "repeat", str(dump)]
   env = os.environ | {"PYTHONPATH": str(tiny.ROOT)}

@@ -1,6 +1,5 @@
 """Seconds from the training command to its first iteration, without and with a cache.
 
-  python -m benchmarks.speed.compile_time --quick
   python -m benchmarks.speed.compile_time --store --backends native --tasks push_plate
 
 Each start is a new process. The cold one finds an empty compilation cache, the warm one
@@ -8,8 +7,6 @@ what the cold one left there. Both find the bank of reset states. Replays hold o
 control periods, so that the figures consist of the imports, which are also timed alone,
 compilation, a short play of the expert, and one iteration.
 """
-
-from __future__ import annotations
 
 import argparse
 from collections.abc import Generator, Iterator
@@ -36,7 +33,6 @@ PERIODS, PATIENCE_S = 8, 1800.0
 
 
 def main() -> None:
-  """Runs the command line; see the module's docstring."""
   parser = command.parser(__doc__, repeats=2)
   tasks = task_names()
   parser.add_argument("--tasks", nargs="+", choices=tasks, default=tasks)
@@ -85,12 +81,7 @@ def cold_and_warm(args: list[str]) -> tuple[float, float]:
 
 @contextlib.contextmanager
 def training(args: list[str], run: Path, **env: str) -> Generator[float]:
-  """Trains in a new process until the context ends.
-
-  Args:
-    args: arguments of ``apnpql train``.
-    run: the run folder.
-    **env: environment variables in addition to those of this process.
+  """Runs ``apnpql train`` until the context ends.
 
   Yields:
     seconds from the command to the first row of metrics.

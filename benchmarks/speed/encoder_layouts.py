@@ -1,6 +1,5 @@
 """Updates per second by the layout of the encoder, and the share of the images.
 
-  python -m benchmarks.speed.encoder_layouts --quick
   python -m benchmarks.speed.encoder_layouts --store
 
 Updates of a preset's agent on transitions of noise that differ only in the encoder.
@@ -8,11 +7,8 @@ Updates of a preset's agent on transitions of noise that differ only in the enco
 the share of the images.
 """
 
-from __future__ import annotations
-
 import argparse
-from collections.abc import Iterator
-import dataclasses
+from collections.abc import Callable, Iterator
 from typing import Any
 from unittest import mock
 
@@ -26,9 +22,10 @@ from apnpql_jax.types import Array
 from benchmarks.common import command, noise, settings, timing
 from benchmarks.speed import learner
 
+Result = dict[str, Any]
+
 
 def main() -> None:
-  """Runs the command line; see the module's docstring."""
   parser = command.parser(__doc__, repeats=15)
   parser.add_argument("--preset", default="push_plate")
   parser.add_argument("--batch", type=int, default=64)
@@ -36,42 +33,28 @@ def main() -> None:
   args = command.parse(parser)
   args.batch = 8 if args.quick else args.batch
   config = settings.preset(args.preset, quick=args.quick)
-  config = settings.with_batch(config, args.batch)
+  config = settings.changed(config, "replay", batch_size=args.batch)
   header = {"preset": args.preset, "batch": args.batch}
   command.publish("encoder_layouts", args, measure_all(config, args), **header)
 
 
-def measure_all(
-  config: TrainConfig, args: argparse.Namespace
-) -> Iterator[dict[str, Any]]:
+def measure_all(config: TrainConfig, args: argparse.Namespace) -> Iterator[Result]:
   """Yields the figures of every layout, timed in turns."""
-  ready = {name: prepare(config, LAYOUTS[name]) for name in args.layouts}
+  ready = {name: LAYOUTS[name](config) for name in args.layouts}
   found = timing.figures("update", ready, repeats=args.repeats)
   for name, figures in found.items():
     yield {"layout": name, **figures}
 
 
-@dataclasses.dataclass(frozen=True)
-class Layout:
-  """Differences of an encoder from that of the preset."""
-
-  agent: dict[str, Any] = dataclasses.field(default_factory=dict)
-  """Settings of the agent."""
-
-  parts: dict[str, Any] = dataclasses.field(default_factory=dict)
-  """Replacements in the module ``encoder``."""
-
-  obs: str = "pixels"
-
-
-def prepare(config: TrainConfig, layout: Layout) -> timing.Ready:
-  """Compiles updates with this encoder."""
-  agent = dataclasses.replace(config.agent, **layout.agent)
-  env = dataclasses.replace(config.env, obs=layout.obs)
-  config = dataclasses.replace(config, agent=agent, env=env)
-  parts: dict[str, Any] = {"PATCH": encoder.PATCH} | layout.parts
-  with mock.patch.multiple(encoder, **parts):
-    return learner.prepare(make_agent(agent), noise.transitions(config))
+def prepare(
+  config: TrainConfig, agent: Result, parts: Result | None = None, obs: str = "pixels"
+) -> timing.Ready:
+  """Compiles updates with other settings of the agent and parts of ``encoder``."""
+  config = settings.changed(config, "agent", **agent)
+  config = settings.changed(config, "env", obs=obs)
+  patches: Result = {"PATCH": encoder.PATCH} | (parts or {})
+  with mock.patch.multiple(encoder, **patches):
+    return learner.prepare(make_agent(config.agent), noise.transitions(config))
 
 
 class Convolutions(encoder.PixelEncoder):
@@ -89,20 +72,21 @@ class Convolutions(encoder.PixelEncoder):
     return flat, jnp.concatenate(points, axis=-1)
 
 
-_APART, _OVERLAP = {"conv_overlap": False}, {"conv_overlap": True}
+_APART: Result = {"conv_overlap": False}
+_OVERLAP: Result = {"conv_overlap": True}
 _MAPS = {"global_features": "map", "wrist_features": "map"}
-_XLA = {"PixelEncoder": Convolutions}
+_BLOCK, _XLA = {"residual_blocks": 1}, {"PixelEncoder": Convolutions}
 
-LAYOUTS = {
-  "none": Layout(obs="state"),
-  "4x4 / 4, 2x2 / 2": Layout(_APART),
-  "4x4 / 4, 3x3 / 2": Layout(_OVERLAP),
-  "4x4 / 4, 2x2 / 2 by XLA": Layout(_APART, _XLA),
-  "4x4 / 4, 3x3 / 2 by XLA": Layout(_OVERLAP, _XLA),
-  "2x2 / 2, 2x2 / 2": Layout(_APART, {"PATCH": 2}),
-  "8x8 / 8, 2x2 / 2": Layout(_APART, {"PATCH": 8}),
-  "4x4 / 4, 2x2 / 2, maps": Layout(_APART | _MAPS),
-  "4x4 / 4, 2x2 / 2, residual block": Layout(_APART | {"residual_blocks": 1}),
+LAYOUTS: dict[str, Callable[[TrainConfig], timing.Ready]] = {
+  "none": lambda config: prepare(config, {}, obs="state"),
+  "4x4 / 4, 2x2 / 2": lambda config: prepare(config, _APART),
+  "4x4 / 4, 3x3 / 2": lambda config: prepare(config, _OVERLAP),
+  "4x4 / 4, 2x2 / 2 by XLA": lambda config: prepare(config, _APART, _XLA),
+  "4x4 / 4, 3x3 / 2 by XLA": lambda config: prepare(config, _OVERLAP, _XLA),
+  "2x2 / 2, 2x2 / 2": lambda config: prepare(config, _APART, {"PATCH": 2}),
+  "8x8 / 8, 2x2 / 2": lambda config: prepare(config, _APART, {"PATCH": 8}),
+  "4x4 / 4, 2x2 / 2, maps": lambda config: prepare(config, _APART | _MAPS),
+  "4x4 / 4, 2x2 / 2, residual block": lambda config: prepare(config, _APART | _BLOCK),
 }
 """Kernel / stride of both layers, as matrix products unless "by XLA"."""
 

@@ -1,14 +1,11 @@
 """Training: steps and updates per second, and the parts of an iteration.
 
-  python -m benchmarks.speed.end_to_end --quick
   python -m benchmarks.speed.end_to_end --store --backends native --tasks push_plate
 
 The iteration of `apnpql train` with the preset of each task: rollouts with the policy,
 then updates. Only the number of worlds differs. The replays are empty, which costs
 nearly the same.
 """
-
-from __future__ import annotations
 
 from typing import Any
 
@@ -29,7 +26,6 @@ from benchmarks.common import command, floor, parts, settings, timing
 
 
 def main() -> None:
-  """Runs the command line; see the module's docstring."""
   parser = command.parser(__doc__, repeats=5)
   settings.add_flags(parser)
   args = command.parse(parser)
@@ -55,10 +51,7 @@ def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
   ready = {name: part for name, (_, part) in pieces.items()}
   ready["iteration"] = timing.Ready(iteration, sum(floors.values()))
   times = timing.measure(ready, repeats=repeats)
-  found = {
-    name: parts.Part(n * times[name].seconds, floors[name])
-    for name, (n, _) in pieces.items()
-  }
+  found = {k: (n * times[k].seconds, floors[k]) for k, (n, _) in pieces.items()}
   whole = times["iteration"]
   return {
     "rollout_length": length,

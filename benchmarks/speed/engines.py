@@ -1,18 +1,14 @@
 """Control periods per second of plain ``mjx.step`` with and without our patches.
 
-  python -m benchmarks.speed.engines --quick
   python -m benchmarks.speed.engines --worlds 1024
 
 Variants of the physics of push_plate: the barrier between bodies, the cones in blocks,
-the scene's limit on contacts, TF32, and MJX-Warp. "qpos_differs" is the largest
-difference from C MuJoCo after the period, in m or rad.
+the scene's limit on contacts, and MJX-Warp. "qpos_differs" is the largest difference
+from C MuJoCo after the period, in m or rad.
 """
 
-from __future__ import annotations
-
 import argparse
-from collections.abc import Iterator
-import dataclasses
+from collections.abc import Iterator, Sequence
 import functools
 from typing import Any
 
@@ -24,8 +20,7 @@ import mujoco.rollout
 import numpy as np
 
 from apnpql_jax.contact_report import SUBSTEPS
-from apnpql_jax.sim.scene import Scene
-from apnpql_jax.tasks import make_task
+from apnpql_jax.tasks import Task, make_task
 from apnpql_jax.types import Array
 from benchmarks.common import command, timing
 from benchmarks.common.mjx_patching import patched
@@ -33,63 +28,44 @@ from benchmarks.common.mjx_patching import patched
 TASK = "push_plate"
 
 
-@dataclasses.dataclass(frozen=True)
-class Variant:
-  """One way to run the physics."""
-
-  impl: str = "jax"
-  barrier: bool = False
-  cones: bool = True
-  limited: bool = True
-  """Whether the scene's limit on contacts applies."""
-
-  precision: str = "highest"
-
-
-VARIANTS = {
-  "barrier and cones": Variant(barrier=True),
-  "cones": Variant(),
-  "cones, all contacts": Variant(limited=False),
-  "barrier": Variant(barrier=True, cones=False),
-  "stock": Variant(cones=False),
-  "cones, TF32": Variant(precision="tensorfloat32"),
-  "Warp": Variant(impl="warp"),
+VARIANTS: dict[str, dict[str, Any]] = {
+  "barrier and cones": {"barrier": True, "cones": True},
+  "barrier": {"barrier": True, "cones": False},
+  "cones": {"barrier": False, "cones": True},
+  "cones, all contacts": {"barrier": False, "cones": True, "limited": False},
+  "stock": {"barrier": False, "cones": False},
+  "Warp": {"barrier": False, "cones": False, "impl": "warp"},
 }
-"""On a CPU the first is in use, on a GPU the second."""
+"""On a CPU the first is in use, on a GPU the third."""
 
 
 def main() -> None:
-  """Runs the command line; see the module's docstring."""
   parser = command.parser(__doc__, repeats=3)
   flag = parser.add_argument
   flag("--worlds", type=int, default=32)
   flag("--substeps", type=int, default=SUBSTEPS, help="physics steps per period")
-  flag(
-    "--variants", nargs="+", choices=VARIANTS, help="default: all that are fast here"
-  )
+  flag("--variants", nargs="+", choices=VARIANTS, help="default: those fast enough")
   args = command.parse(parser)
   if args.quick:
     args.worlds, args.substeps = 2, 1
-  if args.variants is None:
-    args.variants = default_variants()
+  # Without a barrier a period takes minutes on a CPU.
+  slow = jax.default_backend() == "cpu"
+  fast = [name for name in VARIANTS if VARIANTS[name]["barrier"] or not slow]
   header = {"task": TASK, "worlds": args.worlds, "substeps": args.substeps}
-  command.publish("engines", args, measure_all(args), **header)
+  results = measure_all(args.variants or fast, args)
+  command.publish("engines", args, results, **header)
 
 
-def default_variants() -> list[str]:
-  """Returns all on a GPU; on a CPU those with a barrier, as others take hours there."""
-  on_cpu = jax.default_backend() == "cpu"
-  return [name for name, variant in VARIANTS.items() if variant.barrier or not on_cpu]
-
-
-def measure_all(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+def measure_all(
+  names: Sequence[str], args: argparse.Namespace
+) -> Iterator[dict[str, Any]]:
   """Yields the figures of every variant, or why it does not run."""
   task = make_task(TASK)
   start = task.sample_resets(np.random.default_rng(0), args.worlds).qpos
   expected = native_period(task.scene.model, start, args.substeps)
-  for name in args.variants:
+  for name in names:
     try:
-      ready = prepare(task.scene, VARIANTS[name], start, args.substeps)
+      ready = prepare(task, start, args.substeps, **VARIANTS[name])
       figures = timing.figures("period", {name: ready}, repeats=args.repeats)[name]
     except Exception as error:  # Warp may be missing or may not support the scene.
       lines = str(error).splitlines() or [""]
@@ -100,18 +76,26 @@ def measure_all(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def prepare(
-  scene: Scene, variant: Variant, start: np.ndarray, substeps: int
+  task: Task,
+  start: np.ndarray,
+  substeps: int,
+  *,
+  impl: str = "jax",
+  limited: bool = True,
+  **patches: bool,
 ) -> timing.Ready:
-  """Compiles a period of all worlds, from rest at ``start`` to the final qpos."""
-  model, all_contacts = scene.model, make_task(TASK).scene.model
+  """Compiles a period of all worlds, from rest at ``start`` to the final qpos.
+
+  ``limited`` says whether the scene's limit on contacts applies; see also ``patched``.
+  """
+  all_contacts = make_task(TASK).scene.model
   all_contacts.numeric("max_contact_points").data[:] = -1
   sizes = {}
-  if variant.impl == "warp":  # It ignores the limit and shares contacts among worlds.
+  if impl == "warp":  # It ignores the limit and shares contacts among worlds.
     slots = mjx.make_data(all_contacts, impl="jax")._impl
     sizes = {"naconmax": len(start) * slots.ncon, "njmax": slots.nefc}
-  model = model if variant.limited else all_contacts
-  put = mjx.put_model(model, impl=variant.impl)
-  data = mjx.make_data(model, impl=variant.impl, **sizes)
+  model = task.scene.model if limited else all_contacts
+  put, data = mjx.put_model(model, impl=impl), mjx.make_data(model, impl=impl, **sizes)
 
   def period(qpos: Array) -> Array:
     def step(worlds: Any, _: None) -> tuple[Any, None]:
@@ -122,10 +106,7 @@ def prepare(
     return jax.lax.scan(step, worlds, None, length=substeps)[0].qpos
 
   qpos = jnp.asarray(start, jnp.float32)
-  with (
-    patched(barrier=variant.barrier, cones=variant.cones),
-    jax.default_matmul_precision(variant.precision),
-  ):
+  with patched(**patches):
     run, compile_s = timing.compiled(jax.jit(period), qpos)
   return timing.Ready(functools.partial(run, qpos), None, len(start), compile_s)
 

@@ -1,14 +1,11 @@
 """Environment steps per second, without and with the policy, and their parts.
 
-  python -m benchmarks.speed.env_steps --quick
   python -m benchmarks.speed.env_steps --store --backends native --tasks push_plate
 
 A step is one control period of 0.15 s of one world, with its images. "env" acts at
 random. "env_policy" is the rollout of training with an untrained agent of the task's
 preset.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable
 import functools
@@ -26,7 +23,6 @@ from benchmarks.common import command, parts, settings, timing
 
 
 def main() -> None:
-  """Runs the command line; see the module's docstring."""
   parser = command.parser(__doc__, repeats=5)
   settings.add_flags(parser)
   args = command.parse(parser)
@@ -46,28 +42,26 @@ def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
   }
   players = {}
   for name, policy in policies.items():
-    run, compile_s = player(env, policy, params, state, length=length)
-    players[name] = run, compile_s
+    players[name] = player(env, policy, params, state, length=length)
+    run, _ = players[name]
     for _ in range(parts.PLAYED):
       run()
     state, _ = run.carry
   period = parts.prepare(env, agent, params, state)
-  floors = {name: (part.floor_s or 0.0) / worlds for name, part in period.items()}
-  total = sum(floors.values())
-  whole = {"env": total - floors["networks"], "env_policy": total}
+  floors = {name: part.floor_s or 0.0 for name, part in period.items()}
+  total_s = sum(floors.values()) / worlds
+  whole = {"env": total_s - floors["networks"] / worlds, "env_policy": total_s}
   rollouts = {
     name: timing.Ready(run, whole[name], length * worlds, compile_s)
     for name, (run, compile_s) in players.items()
   }
   times = timing.measure(rollouts | period, repeats=repeats)
-  figures: dict[str, Any] = {
-    name: run.figures("step", times[name]) for name, run in rollouts.items()
-  }
-  found = {
-    name: parts.Part(times[name].seconds, worlds * floors[name]) for name in period
-  }
+  found = {name: (times[name].seconds, floors[name]) for name in period}
   period_s = worlds * times["env_policy"].seconds
-  return figures | {"parts": parts.shares(period_s, found)}
+  return {
+    **{name: run.figures("step", times[name]) for name, run in rollouts.items()},
+    "parts": parts.shares(period_s, found),
+  }
 
 
 def player(

@@ -1,6 +1,5 @@
 """Growth of time with worlds, candidates, image size, replay size and contacts.
 
-  python -m benchmarks.speed.growth --quick
   python -m benchmarks.speed.growth --store --axes worlds --worlds 1 16 256
 
 The task is push_plate, except for contacts. There it is place_plate, which has the
@@ -8,12 +7,11 @@ most: some of its contact pairs are removed, and every point of the others gets 
 Sizes for which the memory does not suffice are left out.
 """
 
-from __future__ import annotations
-
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 import dataclasses
 import functools
+import itertools
 import sys
 from typing import Any
 
@@ -39,12 +37,11 @@ from benchmarks.speed import env_steps, learner
 WORLDS, PLAYED = 32, 16
 """Worlds, except along their axis; periods after the reset at which they are timed."""
 
-Sizes = Iterator[tuple[str, int, Callable[[], timing.Ready]]]
-"""Series, size, and a function that prepares it."""
+Sizes = Iterator[tuple[Any, ...]]
+"""Series, size, a function that prepares it, and its arguments."""
 
 
 def main() -> None:
-  """Runs the command line; see the module's docstring."""
   parser = command.parser(__doc__, repeats=3)
   lists = functools.partial(parser.add_argument, nargs="+")
   lists("--axes", choices=AXES, default=list(AXES))
@@ -66,9 +63,9 @@ def measure_all(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
   config = settings.preset("push_plate", quick=args.quick)
   for axis in args.axes:
     ready = {}
-    for series, size, prepare in AXES[axis](config, args):
+    for series, size, prepare, *given in AXES[axis](config, args):
       try:
-        ready[series, size] = prepare()
+        ready[series, size] = prepare(*given)
       except ConfigError as error:  # The memory does not suffice.
         print(f"{axis} {series} {size}: {error}", file=sys.stderr)
     times = timing.measure(ready, repeats=args.repeats)
@@ -81,17 +78,15 @@ def measure_all(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 def worlds(config: TrainConfig, args: argparse.Namespace) -> Sizes:
   """One control period with images and random actions."""
-  for backend in args.backends:
-    for count in args.worlds:
-      env = dataclasses.replace(config.env, backend=backend, worlds=count)
-      yield backend, count, lambda env=env: _period(env)
+  for backend, count in itertools.product(args.backends, args.worlds):
+    chosen = settings.changed(config, "env", backend=backend, worlds=count)
+    yield backend, count, _period, chosen.env
 
 
 def candidates(config: TrainConfig, args: argparse.Namespace) -> Sizes:
   """One update."""
   for count in args.candidates:
-    chosen = settings.with_candidates(config, count)
-    yield "update", count, lambda chosen=chosen: _update(chosen)
+    yield "update", count, _update, settings.with_candidates(config, count)
 
 
 def pixels(config: TrainConfig, args: argparse.Namespace) -> Sizes:
@@ -99,17 +94,16 @@ def pixels(config: TrainConfig, args: argparse.Namespace) -> Sizes:
   for scale in args.scales:
     names = ("global_size", "wrist_size")
     sides = {k: tuple(round(scale * x) for x in getattr(config.env, k)) for k in names}
-    env = dataclasses.replace(config.env, **sides, worlds=WORLDS)
+    chosen = settings.changed(config, "env", **sides, worlds=WORLDS)
     size = sum(height * width for height, width in sides.values())
-    yield "rendering", size, lambda env=env: _images(env)
-    chosen = dataclasses.replace(config, env=env)
-    yield "update", size, lambda chosen=chosen: _update(chosen)
+    yield "rendering", size, _images, chosen.env
+    yield "update", size, _update, chosen
 
 
 def slots(config: TrainConfig, args: argparse.Namespace) -> Sizes:
   """Adding a rollout, excluding what a broken world leaves, and drawing a batch."""
   for count in args.slots:
-    yield "add and draw", count, lambda count=count: _replay(config, count)
+    yield "add and draw", count, _replay, config, count
 
 
 def contacts(config: TrainConfig, args: argparse.Namespace) -> Sizes:
@@ -120,7 +114,7 @@ def contacts(config: TrainConfig, args: argparse.Namespace) -> Sizes:
     scene = load_scene(mjcf_path("place_plate"), variants=[keep])
     size = mjx.make_data(scene.model, impl="jax")._impl.ncon
     for backend in args.backends:
-      yield backend, size, functools.partial(_physics, scene, backend)
+      yield backend, size, _physics, scene, backend
 
 
 AXES = {f.__name__: f for f in (worlds, candidates, pixels, slots, contacts)}

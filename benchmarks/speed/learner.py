@@ -1,6 +1,5 @@
 """Updates per second of the learner, by batch and candidates.
 
-  python -m benchmarks.speed.learner --quick
   python -m benchmarks.speed.learner --store
   python -m benchmarks.speed.learner --batch 64 --candidates 120 --lstm-instants 4
 
@@ -8,8 +7,6 @@ The agent is that of a preset; its transitions are noise. The features phi of a 
 are computed once and serve all candidate actions. "repeated" is the same learner, but
 it encodes the images again for each candidate, which the paper avoids.
 """
-
-from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
@@ -30,9 +27,10 @@ from apnpql_jax.config import AgentConfig, TrainConfig
 from apnpql_jax.types import Array, Observation, Transition
 from benchmarks.common import command, floor, noise, settings, timing
 
+Result = dict[str, Any]
+
 
 def main() -> None:
-  """Runs the command line; see the module's docstring."""
   parser = command.parser(__doc__, repeats=5)
   parser.add_argument("--preset", default="push_plate")
   parser.add_argument("--batch", type=int, nargs="+", default=[32, 64, 128])
@@ -44,18 +42,16 @@ def main() -> None:
   if args.quick:
     args.batch, args.candidates = [8], [8]
   if args.lstm_instants is not None:
-    agent = dataclasses.replace(config.agent, lstm_instants=args.lstm_instants)
-    config = dataclasses.replace(config, agent=agent)
+    config = settings.changed(config, "agent", lstm_instants=args.lstm_instants)
   header = {"preset": args.preset, "lstm_instants": config.agent.lstm_instants}
   command.publish("learner", args, measure_all(config, args), **header)
 
 
-def measure_all(
-  config: TrainConfig, args: argparse.Namespace
-) -> Iterator[dict[str, Any]]:
+def measure_all(config: TrainConfig, args: argparse.Namespace) -> Iterator[Result]:
   """Yields the figures of every setting, with phi once and repeated."""
   for batch, candidates in itertools.product(args.batch, args.candidates):
-    chosen = settings.with_candidates(settings.with_batch(config, batch), candidates)
+    chosen = settings.changed(config, "replay", batch_size=batch)
+    chosen = settings.with_candidates(chosen, candidates)
     transitions = noise.transitions(chosen)
     ready = {phi: prepare(AGENTS[phi](chosen.agent), transitions) for phi in args.phi}
     found = timing.figures("update", ready, repeats=args.repeats)
@@ -127,8 +123,7 @@ def forgetful_agent(config: AgentConfig) -> Agent:
   """Returns the agent that encodes images for every candidate."""
 
   def build(*args: Any) -> ForgetfulNetworks:
-    networks = make_networks(*args)
-    return ForgetfulNetworks(networks.modules, networks.evaluation, networks.config)
+    return ForgetfulNetworks(**vars(make_networks(*args)))
 
   with mock.patch.object(learner, "make_networks", build):
     return make_agent(config)

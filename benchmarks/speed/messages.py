@@ -7,8 +7,6 @@ They are read from the program that XLA makes for that many CPU devices; nothing
 Sizes are those that each device holds afterwards: the whole gradients, its whole batch.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -29,7 +27,6 @@ _BYTES = {"pred": 1, "s8": 1, "u8": 1, "s32": 4, "u32": 4, "f32": 4}
 
 
 def main() -> None:
-  """Runs the command line; see the module's docstring."""
   parser = command.parser(__doc__)
   parser.add_argument("--preset", default="push_plate")
   parser.add_argument("--devices", type=int, default=4)
@@ -57,7 +54,7 @@ def measure(config: TrainConfig, devices: int) -> dict[str, int]:
     return place(agent.update(state.learner, batch, state.key), mesh)
 
   batch = jax.eval_shape(sample, state.replay, state.expert_replay, state.key)
-  sizes = message_bytes(jax.jit(update).lower(state).compile().as_text() or "")
+  sizes = list(map(size, messages(jax.jit(update).lower(state).compile())))
   return {
     "parameters_bytes": leaves.nbytes(state.learner.params),
     "batch_bytes": leaves.nbytes(batch),
@@ -71,28 +68,29 @@ def measure(config: TrainConfig, devices: int) -> dict[str, int]:
 def table(report: dict[str, Any]) -> str:
   """Returns the table of docs/scaling.md."""
   replay = "for comparison: the agent's replay, its part on each device"
-  rows = {
-    "parameters, and so gradients": "parameters_bytes",
-    "batch": "batch_bytes",
-    f"sent, in {report['messages']} messages": "messages_bytes",
-    replay: "replay_bytes_per_device",
-  }
+  rows = (
+    ("parameters, and so gradients", "parameters_bytes"),
+    ("batch", "batch_bytes"),
+    (f"sent, in {report['messages']} messages", "messages_bytes"),
+    (replay, "replay_bytes_per_device"),
+  )
   about = f"{report['preset']} on {report['devices']} devices, "
   about += f"jax {report['versions']['jax']}, commit {report['commit']}."
-  cells = [(name, f"{report[key]:,}") for name, key in rows.items()]
+  cells = [(name, f"{report[key]:,}") for name, key in rows]
   return f"{about}\n\n{tables.table(('of one update', 'bytes'), cells)}"
 
 
-def message_bytes(program: str) -> list[int]:
-  """Returns the sizes of the messages in the text of a compiled program."""
-  sent = re.findall(rf"= (.*) (?:{_KINDS})(?:-start)?\(", program)
-  return [
-    sum(
-      _BYTES[kind] * math.prod(map(int, re.findall(r"\d+", shape)))
-      for kind, shape in re.findall(r"\b([a-z]+\d*)\[([\d,]*)\]", types)
-    )
-    for types in sent
-  ]
+def messages(program: Any) -> list[str]:
+  """Returns what devices running a compiled program send, as XLA writes its types."""
+  return re.findall(rf"= (.*) (?:{_KINDS})(?:-start)?\(", program.as_text())
+
+
+def size(types: str) -> int:
+  """Returns the bytes of the arrays in a text such as ``(f32[16,7]{1,0}, pred[])``."""
+  return sum(
+    _BYTES[kind] * math.prod(map(int, re.findall(r"\d+", shape)))
+    for kind, shape in re.findall(r"\b([a-z]+\d*)\[([\d,]*)\]", types)
+  )
 
 
 if __name__ == "__main__":

@@ -1,13 +1,10 @@
 """Pairs of images per second by the layout of the ray caster's work.
 
-  python -m benchmarks.speed.ray_layouts --quick
   python -m benchmarks.speed.ray_layouts --store
 
 All layouts draw the same pairs of images of push_plate. "agreeing" is the share of the
 pixels whose bits equal those of ``render``.
 """
-
-from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
@@ -33,7 +30,6 @@ Cast = tuple[Array, Array]
 
 
 def main() -> None:
-  """Runs the command line; see the module's docstring."""
   parser = command.parser(__doc__, repeats=15)
   parser.add_argument("--batch", type=int, nargs="+", default=[32, 256])
   parser.add_argument("--layouts", nargs="+", choices=LAYOUTS, default=list(LAYOUTS))
@@ -53,7 +49,7 @@ def measure_all(args: argparse.Namespace, sizes: Sizes) -> Iterator[dict[str, An
     poses = make_poses(scene, batch)
     floor_s, ready = floor.count(plain, poses).seconds() / batch, {}
     for name in args.layouts:
-      run, compile_s = LAYOUTS[name].compiled(scene, sizes, poses)
+      run, compile_s = prepare(scene, sizes, poses, **LAYOUTS[name])
       run = functools.partial(run, poses)
       ready[name] = timing.Ready(run, floor_s, batch, compile_s)
     expected = jax.jit(plain)(poses)
@@ -70,28 +66,25 @@ def agreeing(drawn: list[Array], expected: list[Array]) -> float:
   return float(jnp.concatenate(same).mean())
 
 
-@dataclasses.dataclass(frozen=True)
-class Layout:
-  """Differences from the layout of ``render``."""
+def prepare(
+  scene: Scene,
+  sizes: Sizes,
+  poses: Any,
+  still: bool = True,
+  options: Any = None,
+  **parts,
+) -> tuple[Any, float]:
+  """Compiles both images with other ``parts`` of ``raycast`` or ``options`` of XLA.
 
-  parts: dict[str, Any] = dataclasses.field(default_factory=dict)
-  """Replacements in the module ``raycast``."""
-
-  options: dict[str, Any] = dataclasses.field(default_factory=dict)
-  """Compiler options of XLA."""
-
-  still: bool = True
-  """Whether the global camera draws what never moves in front of it. Without, images
-  are wrong: this bounds the gain of casting the still geoms once per episode."""
-
-  def compiled(self, scene: Scene, sizes: Sizes, poses: Any) -> tuple[Any, float]:
-    """Compiles both images; see ``timing.compiled``."""
-    whole = make_pair(scene, sizes)
-    overview = whole if self.still else make_pair(without_still(scene), sizes)
-    parts: dict[str, Any] = {"BLOCKS": raycast.BLOCKS} | self.parts
-    with mock.patch.multiple(raycast, **parts):
-      pair = jax.jit(lambda poses: [overview(poses)[0], whole(poses)[1]])
-      return timing.compiled(pair, poses, options=self.options)
+  Without what is ``still`` in front of the global camera its images are wrong. That
+  bounds the gain of casting still geoms once per episode.
+  """
+  whole = make_pair(scene, sizes)
+  overview = whole if still else make_pair(without_still(scene), sizes)
+  patches: dict[str, Any] = {"BLOCKS": raycast.BLOCKS} | parts
+  with mock.patch.multiple(raycast, **patches):
+    pair = jax.jit(lambda poses: [overview(poses)[0], whole(poses)[1]])
+    return timing.compiled(pair, poses, options=options)
 
 
 def without_still(scene: Scene) -> Scene:
@@ -136,13 +129,13 @@ _FAST_MATH = {
   "xla_cpu_fast_math_honor_division": False,
   "xla_cpu_fast_math_honor_functions": False,
 }
-LAYOUTS = {
-  "fold, 4 blocks": Layout({"BLOCKS": 4}),
-  "fold, 1 block": Layout({"BLOCKS": 1}),
-  "fold, 16 blocks": Layout({"BLOCKS": 16}),
-  "types at once": Layout({"_cast": cast_by_type}),
-  "fast math": Layout(options=_FAST_MATH),
-  "without what is still": Layout(still=False),
+LAYOUTS: dict[str, dict[str, Any]] = {
+  "fold, 4 blocks": {"BLOCKS": 4},
+  "fold, 1 block": {"BLOCKS": 1},
+  "fold, 16 blocks": {"BLOCKS": 16},
+  "types at once": {"_cast": cast_by_type},
+  "fast math": {"options": _FAST_MATH},
+  "without what is still": {"still": False},
 }
 """The first is that of ``render``."""
 

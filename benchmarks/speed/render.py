@@ -1,6 +1,5 @@
 """Camera pairs per second of the ray caster on push_plate, by batch and resolution.
 
-  python -m benchmarks.speed.render --quick
   python -m benchmarks.speed.render --store
 
 A pair is one image of "global" and one of "wrist" of the same world. Some batches are
@@ -8,11 +7,8 @@ also drawn with the shadow of the hand. MuJoCo's renderer and PyBullet's TinyRen
 draw pairs in the same run, one world in one process, where they are installed.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterator
-import dataclasses
 import functools
 import itertools
 from pathlib import Path
@@ -21,15 +17,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from apnpql_jax.cameras import make_cameras
 from apnpql_jax.config import EnvConfig
 from apnpql_jax.presets import mjcf_path
 from apnpql_jax.render import Geoms
-from apnpql_jax.sim.kinematics import Kinematics
+from apnpql_jax.sim.kinematics import Kinematics, make_kinematics
+from apnpql_jax.sim.physics import initial_state
 from apnpql_jax.sim.scene import Scene, load_scene
+from apnpql_jax.tasks import make_task
 from apnpql_jax.types import Array
 from benchmarks.common import command, floor, timing
 from benchmarks.peers import sides, worlds
@@ -43,7 +40,7 @@ RESOLUTIONS: dict[str, Sizes] = {
   "sim_to_real": {"global": (120, 160), "wrist": (60, 107)},
   "tiny": {"global": (12, 16), "wrist": (8, 12)},
 }
-OTHERS = {
+OTHERS: dict[str, tuple[str, dict[str, Any]]] = {
   "mujoco_egl": ("mujoco_worlds", {"MUJOCO_GL": "egl"}),
   "mujoco_osmesa": ("mujoco_worlds", {"MUJOCO_GL": "osmesa"}),
   "pybullet_tiny": ("pybullet_worlds", {}),
@@ -52,7 +49,6 @@ OTHERS = {
 
 
 def main() -> None:
-  """Runs the command line; see the module's docstring."""
   parser = command.parser(__doc__, repeats=15)
   flag = parser.add_argument
   flag("--alone", action="store_true", help="without the other renderers")
@@ -95,7 +91,7 @@ def measure_other(renderer: str, sizes: Sizes, repeats: int) -> dict[str, Any]:
     worlds.export(SCENE, sizes, Path(folder))
     settings = {"folder": folder, "gymnasium": False}
     try:
-      with sides.Side(module, settings, env=env, limit_s=120) as side:
+      with sides.Side(module, settings, limit_s=120, **env) as side:
         rates = [side.rate("images", 2 * timing.SECONDS) for _ in range(repeats)]
     except sides.SideFailed as error:
       return {"missing": str(error)}
@@ -120,21 +116,9 @@ def make_pair(
 
 
 def make_poses(scene: Scene, batch: int) -> Kinematics:
-  """Draws worlds [batch, ...] with the arm near its working posture."""
-  data, rng = mujoco.MjData(scene.model), np.random.default_rng(0)
-  names = {field.name for field in dataclasses.fields(Kinematics)} - {"fields"}
-  worlds = []
-  for _ in range(batch):
-    mujoco.mj_resetData(scene.model, data)
-    data.qpos[:6] = [0.0, -1.2, 1.9, -2.2, -1.57, 0.0] + rng.normal(size=6) * 0.2
-    mujoco.mj_forward(scene.model, data)
-    worlds.append({name: np.array(getattr(data, name), np.float32) for name in names})
-  poses = {}
-  for name in names:
-    tail = (3, 3) if name.endswith("mat") else (3,)
-    stacked = np.stack([world[name] for world in worlds])
-    poses[name] = jnp.asarray(stacked.reshape(batch, -1, *tail))
-  return Kinematics(**poses, fields={})
+  """Draws reset states of the scene and returns their poses [batch, ...]."""
+  draw = make_task(scene.name).sample_resets(np.random.default_rng(0), batch)
+  return jax.jit(make_kinematics(scene))(initial_state(scene, *map(jnp.asarray, draw)))
 
 
 if __name__ == "__main__":
