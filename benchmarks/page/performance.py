@@ -50,8 +50,8 @@ ANSWER: tuple[tuple[str, str, str, dict[str, Any]], ...] = (
   ("steps/s while training on push_plate", "", "end_to_end.steps_per_s", TRAIN),
   ("updates/s while training on push_plate", "", "end_to_end.updates_per_s", TRAIN),
   ("pairs of camera images/s", "", "render.pairs_per_s", IMAGES),
-  ("s to the first iteration of training", "", "compile_time.cold.seconds", START),
-  ("the same with a compilation cache", "", "compile_time.warm.seconds", START),
+  ("seconds to the first iteration, cold", "", "compile_time.cold.seconds", START),
+  ("seconds to the first iteration, warm", "", "compile_time.warm.seconds", START),
 )
 """What a user gets on two cores: row, goals, figure, and settings of the results."""
 
