@@ -27,7 +27,8 @@ def main(run: Path) -> None:
   learner = agent.init(jax.random.key(0), state.observation)
   act, step = jax.jit(agent.act, static_argnums=3), jax.jit(env.step)
   for key in jax.random.split(jax.random.key(1), 10):
-    action, _ = act(learner.params, state.observation, key, False)  # f32[4, 7]; not greedy.
+    # The last argument is "greedy"; actions are f32[4, 7].
+    action, _ = act(learner.params, state.observation, key, False)
     state = step(state, action, key)
   print("rewards:", state.timestep.reward)
   print(apnpql.train(config, run, overwrite=True))

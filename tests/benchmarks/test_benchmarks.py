@@ -1,49 +1,61 @@
-"""The benchmarks: each runs and reports what can be, and the document is made of it."""
+"""The benchmarks run and report, and the document consists of their reports."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 import functools
+import importlib
 import itertools
 import json
 import os
+import pkgutil
 import subprocess
 import sys
+import threading
 import time
 from typing import Any
 
-import floor
 import jax
 import jax.numpy as jnp
 import numpy as np
-import parts
 import pytest
-import report
-import resume
-import soak
-import tables
-import timing
 
 from apnpql_jax import testing
+from apnpql_jax.config.files import mjcf_path
 from apnpql_jax.runs.metrics import MetricWriter
+from apnpql_jax.sim.scene import load_scene
+import benchmarks
+from benchmarks.common import (
+  floor,
+  noise,
+  parts,
+  settings,
+  store,
+  tables,
+  timing,
+  turns,
+)
+from benchmarks.page import performance, reports
+from benchmarks.quality import tasks
+from benchmarks.reliability import resume, soak
+from benchmarks.speed import messages, ray_layouts, render
 
-PEAK = {"flops_per_s": 2e9, "bytes_per_s": 1e9}
 MACHINE = {
   "device": "a machine",
   "cores": 2,
   "versions": {"jax": "1.2"},
   "commit": "abc",
-  "peak": PEAK,
+  "peak": {"flops_per_s": 2e9, "bytes_per_s": 1e9},
   "repeats": 3,
 }
 
 
-def run(script: str, *args: str) -> dict[str, Any]:
-  """The report of a benchmark in a process of its own; it prints nothing else."""
+def run(module: str, *args: str) -> dict[str, Any]:
+  """Returns the report of a benchmark, which prints nothing else."""
   done = subprocess.run(
-    [sys.executable, f"benchmarks/{script}.py", "--quick", "--json", *args],
-    cwd=tables.ROOT,
-    env=os.environ | {"XLA_FLAGS": testing.XLA_FLAGS, "PYTHONPATH": str(tables.ROOT)},
+    [sys.executable, "-m", module, "--quick", "--json", *args],
+    cwd=store.ROOT,
+    env=os.environ | {"PYTHONPATH": str(store.ROOT)},
     capture_output=True,
     text=True,
     check=False,
@@ -53,7 +65,7 @@ def run(script: str, *args: str) -> dict[str, Any]:
 
 
 def dicts(tree: Any) -> Iterator[dict[str, Any]]:
-  """All dictionaries in a report."""
+  """Yields all dictionaries in a report."""
   if isinstance(tree, dict):
     yield tree
     tree = list(tree.values())
@@ -62,54 +74,81 @@ def dicts(tree: Any) -> Iterator[dict[str, Any]]:
       yield from dicts(value)
 
 
-SLOW = pytest.mark.slow
+def slow(*values: Any) -> Any:
+  return pytest.param(*values, marks=pytest.mark.slow)
 
 
 @pytest.mark.parametrize(
-  ("script", "args"),
+  ("name", "args"),
   [
-    ("render", ["--alone"]),
-    ("encoder_layouts", ["--layouts", "none", "4x4 / 4, 3x3 / 2 by XLA"]),
-    ("env_steps", ["--obs", "state"]),
-    ("growth", ["--axes", "candidates", "slots"]),
-    pytest.param("ray_layouts", [], marks=SLOW),
-    pytest.param("encoder_layouts", [], marks=SLOW),
-    pytest.param("learner", [], marks=SLOW),
-    pytest.param("learner", ["--lstm-instants", "2"], marks=SLOW),
-    pytest.param("env_steps", [], marks=SLOW),
-    pytest.param("end_to_end", [], marks=SLOW),
-    pytest.param("compile_time", [], marks=SLOW),
-    pytest.param("growth", [], marks=SLOW),
+    ("growth", ["--axes", "slots"]),
+    slow("growth", []),
+    slow("render", ["--alone"]),
+    slow("ray_layouts", []),
+    slow("learner", []),
+    slow("learner", ["--lstm-instants", "2", "--phi", "once"]),
+    slow("encoder_layouts", []),
+    slow("env_steps", []),
+    slow("env_steps", ["--obs", "state"]),
+    slow("end_to_end", []),
+    slow("compile_time", []),
+    slow("engines", ["--variants", "barrier and cones", "Warp"]),
+    slow("fidelity", []),
   ],
 )
-def test_a_benchmark_reports_what_can_be(script, args):
-  found = run(script, *args)
-  assert found["benchmark"] == script and found["results"]
+def test_a_benchmark_reports_its_figures(name, args):
+  found = run(reports.module(name), *args)
+  assert found["benchmark"] == name and found["results"]
   assert found["cores"] >= 1 and found["versions"]["jax"] == jax.__version__
-  assert min(found["peak"].values()) > 0
-  spreads = 0
+  if "peak" in found:
+    assert min(found["peak"].values()) > 0 and found["repeats"]
   for entry in dicts(found["results"]):
-    for name in [key[:-4] for key in entry if key.endswith("_low")]:
-      assert 0 < entry[f"{name}_low"] <= entry[name] <= entry[f"{name}_high"]
-      spreads += 1
+    for key in [key[:-4] for key in entry if key.endswith("_low")]:
+      assert 0 < entry[f"{key}_low"] <= entry[key] <= entry[f"{key}_high"]
     if "parts" in entry:
       shares = [part["share"] for part in entry["parts"].values()]
       assert all(0 <= share <= 1 for share in shares)
       assert sum(shares) == pytest.approx(1.0)
     if "floor_s" in entry:
       assert entry["floor_s"] > 0 and entry["of_floor"] > 0
-  assert spreads
-  # What a script reports, the document can be made of.
-  assert "| --- |" in report.SECTIONS[script](found)
+    if "qpos_differs" in entry:
+      assert entry["qpos_differs"] < 1e-4
+  # The document can be made of it.
+  assert "| --- |" in reports.block(found)
+
+
+def test_every_module_can_be_imported():
+  missing = set()
+  for module in pkgutil.walk_packages(benchmarks.__path__, "benchmarks."):
+    try:
+      importlib.import_module(module.name)
+    except ModuleNotFoundError as error:
+      missing.add(error.name)
+  assert missing <= {"pybullet", "torch"}
 
 
 def test_other_layouts_draw_the_same():
-  same = ["fold, 16 blocks", "types at once", "one by one, in sight"]
-  found = run("ray_layouts", "--layouts", *same)
-  assert [result["layout"] for result in found["results"]] == same
-  for result in found["results"]:
-    assert result["agreeing"] > 0.999
-  assert "| types at once | 2 | " in report.SECTIONS["ray_layouts"](found)
+  sizes = render.RESOLUTIONS["tiny"]
+  scene = load_scene(mjcf_path(render.SCENE))
+  poses = render.make_poses(scene, 2)
+  pair = jax.jit(render.make_pair(scene, sizes), compiler_options=testing.FAST_COMPILE)
+  expected = pair(poses)
+  for name in ("fold, 16 blocks", "types at once"):
+    fast: Any = ray_layouts.LAYOUTS[name] | {"options": testing.FAST_COMPILE}
+    program, _ = ray_layouts.prepare(scene, sizes, poses, **fast)
+    assert ray_layouts.agreeing(program(poses), expected) > 0.999
+  assert ray_layouts.agreeing([x + 1 for x in expected], expected) == 0.0
+
+
+def test_noise_has_the_shapes_of_the_training():
+  config = settings.changed(settings.preset("", quick=True), "replay", batch_size=6)
+  batch = noise.transitions(settings.changed(config, "agent", lstm_instants=3))
+  seen = batch.observation_t
+  image: Any = seen.global_image
+  assert image.shape == (6, 3, 12, 16, 3) and seen.objects is None
+  assert image.dtype == jnp.uint8 and image.std() > 50
+  assert seen.robot.shape == (6, 3, 21) and 0 <= seen.robot.min() < seen.robot.max() < 1
+  assert batch.window is None and batch.action_tm1.shape == (6, 7)
 
 
 def test_operations_are_counted_as_often_as_loops_turn():
@@ -137,7 +176,7 @@ def test_the_floor_is_the_slower_of_computing_and_moving(monkeypatch):
   assert floor.Work(20.0, 500.0).seconds() == 5.0
 
 
-def test_times_are_of_one_thing_and_runs_take_turns():
+def test_times_are_of_one_unit_and_programs_take_turns():
   calls = []
 
   def nap(name: str, seconds: float) -> jax.Array:
@@ -145,33 +184,79 @@ def test_times_are_of_one_thing_and_runs_take_turns():
     calls.append(name)
     return jnp.zeros(())
 
-  ready = [
-    timing.Ready(functools.partial(nap, "one", 0.01), floor_s=0.005),
-    timing.Ready(functools.partial(nap, "ten", 0.04), floor_s=0.001, things=10),
-  ]
-  one, ten = timing.measure(ready, repeats=3, seconds=0.03)
+  ready = {
+    "one": timing.Ready(functools.partial(nap, "one", 0.01), floor_s=0.005),
+    "ten": timing.Ready(functools.partial(nap, "ten", 0.04), floor_s=0.001, units=10),
+  }
+  times = timing.measure(ready, repeats=3, seconds=0.03)
+  one, ten = times["one"], times["ten"]
   assert len(one.wall) == len(ten.wall) == 3
   assert 0.01 <= one.seconds < 0.03
   assert 0.004 <= ten.seconds < 0.012
   assert one.per(10).seconds == pytest.approx(one.seconds / 10)
   # Two calls of each that do not count, then three rounds.
-  turns = [name for name, _ in itertools.groupby(calls)]
-  assert turns == ["one", "ten"] * 4 and calls.count("ten") == 5
-  figures = ready[1].figures("step", ten)
+  taken = [name for name, _ in itertools.groupby(calls)]
+  assert taken == ["one", "ten"] * 4 and calls.count("ten") == 5
+  figures = ready["ten"].figures("step", ten)
   assert figures["steps_per_s"] == pytest.approx(1 / ten.seconds)
   assert figures["of_floor"] == pytest.approx(0.001 / ten.seconds)
 
 
+def test_who_measures_waits_for_who_compiles(tmp_path, monkeypatch):
+  monkeypatch.setenv(turns.FOLDER, str(tmp_path))
+  events, compiling = [], threading.Event()
+
+  def measure() -> None:
+    with turns.turn():
+      events.append("measured")
+
+  def compile_slowly() -> None:
+    with turns.turn(shared=True):
+      compiling.set()
+      time.sleep(0.2)
+      events.append("compiled")
+
+  threads = [threading.Thread(target=compile_slowly) for _ in range(2)]
+  for thread in threads:
+    thread.start()
+  assert compiling.wait(10)
+  threads.append(threading.Thread(target=measure))
+  threads[-1].start()
+  for thread in threads:
+    thread.join()
+  assert events == ["compiled", "compiled", "measured"]
+
+
 def test_shares_add_up_even_if_parts_are_slower_alone():
   def shares(whole_s: float, **seconds: float) -> list[float]:
-    found = {name: parts.Part(x, floor_s=0.5) for name, x in seconds.items()}
-    return [part["share"] for part in parts.shares(whole_s, found).values()]
+    found = parts.shares(whole_s, {name: (s, 0.5) for name, s in seconds.items()})
+    return [part["share"] for part in found.values()]
 
   assert shares(4.0, a=1.0, b=2.0) == [0.25, 0.5, 0.25]
   assert shares(2.0, a=1.0, b=3.0) == [0.25, 0.75, 0.0]
 
 
-def test_the_soak_sees_metrics_that_were_put_aside_and_every_other_loss(tmp_path):
+def test_messages_are_read_from_a_program():
+  class Program:
+    def as_text(self) -> str:
+      return """
+        %sum = (f32[16,7]{1,0}, pred[]) all-reduce(%a, %b), replica_groups={}
+        %parts = u8[3,2]{1,0} all-gather-start(%c), dimensions={0}
+        %add = f32[100]{0} add(%d, %e)
+      """
+
+  sent = messages.messages(Program())
+  assert [messages.size(types) for types in sent] == [16 * 7 * 4 + 1, 6]
+
+
+@pytest.mark.slow
+def test_an_update_on_several_devices_sends_messages():
+  found = run("benchmarks.speed.messages", "--devices", "2")
+  assert found["messages_bytes"] >= found["parameters_bytes"] + found["batch_bytes"]
+  assert found["largest_message_bytes"] <= found["messages_bytes"]
+
+
+def test_the_soak_reads_all_metrics_and_compares_every_loss(tmp_path):
   losses = np.linspace(1.0, 0.1, 40)
   runs = {"long": losses, "short": losses[:30], "gap": losses[1:], "other": losses + 1}
   for name, values in runs.items():
@@ -188,28 +273,40 @@ def test_the_soak_sees_metrics_that_were_put_aside_and_every_other_loss(tmp_path
   assert not soak.same_metrics(short, other)
 
 
-def test_what_differs_after_a_resume_is_told_by_how_much():
+def test_the_soak_fits_the_growth_of_memory():
+  samples = [(0.0, 50.0), *((float(i), 100.0 + 2.0 * i) for i in range(3, 11))]
+  found = soak.growth(samples)
+  assert found["slope_mib_per_h"] == pytest.approx(120.0)
+  assert found["minutes_mib"][1] == [3.0, 106.0]
+
+
+def test_a_resumed_run_is_compared_array_by_array():
   a = {"x": np.array([1.0, -4.0], np.float32), "n": np.arange(3), "k": np.zeros(2)}
   assert resume.compare(a, a) == {"arrays": 3, "same_bits": 3, "differ": {}}
   b = a | {"x": np.array([1.0, -3.0], np.float32), "k": np.array([0.0, -0.0])}
-  told = resume.compare(a, b)
-  assert told == {"arrays": 3, "same_bits": 1, "differ": {"x": 0.25, "k": 0.0}}
+  found = resume.compare(a, b)
+  assert found == {"arrays": 3, "same_bits": 1, "differ": {"x": 0.25, "k": 0.0}}
   with pytest.raises(ValueError, match="only one state has .*'n'"):
     resume.compare(a, {"x": a["x"], "k": a["k"]})
 
 
-def test_the_document_is_what_the_stored_reports_make(tmp_path):
-  doc = tmp_path / "performance.md"
-  doc.write_text(tables.PERFORMANCE.read_text())
-  report.write(docs=doc)
-  assert doc.read_text() == tables.PERFORMANCE.read_text()
+def test_the_documents_are_what_the_stored_reports_make(tmp_path):
+  copies = {}
+  for doc in (performance.DOC, tasks.DOC, messages.DOC):
+    copies[doc] = tmp_path / doc.name
+    copies[doc].write_text(doc.read_text())
+  performance.write(doc=copies[performance.DOC])
+  tasks.write_tables(copies[tasks.DOC])
+  sent = json.loads((store.RESULTS / "messages.json").read_text())
+  tables.put("messages", messages.table(sent), copies[messages.DOC])
+  for doc, copy in copies.items():
+    assert copy.read_text() == doc.read_text(), doc.name
 
 
 def test_the_document_is_made_of_what_is_at_hand(tmp_path):
   doc = tmp_path / "performance.md"
-  marks = [
-    f"<!-- {name} -->\nas before\n<!-- end {name} -->" for name in report.SECTIONS
-  ]
+  names = [*performance.BLOCKS, "gpu", "answer"]
+  marks = [f"<!-- {name} -->\nas before\n<!-- end {name} -->" for name in names]
   doc.write_text("\n".join(marks))
   speed = {"steps_per_s": 50.0, "steps_per_s_low": 40.0, "steps_per_s_high": 60.0}
   speed |= {"floor_s": 0.001, "of_floor": 0.05}
@@ -230,25 +327,35 @@ def test_the_document_is_made_of_what_is_at_hand(tmp_path):
     }
     for size, seconds in ((1, 0.1), (4, 0.2), (16, 0.8))
   ]
+  image = {"resolution": "paper", "shadow": False, "batch": 2}
+  pairs = image | {"renderer": "ray_caster", "pairs_per_s": 30.0}
+  other = {"resolution": "paper", "renderer": "mujoco_egl", "pairs_per_s": 10.0}
   missing = {"resolution": "paper", "renderer": "pybullet_tiny", "missing": "no module"}
-  render = {"scene": "s", "resolutions": {"paper": {"global": (72, 96)}}}
-  reports = {
-    "render": render | {"results": [missing]},
+  sizes = {"resolutions": {"paper": {"global": (72, 96)}}}
+  stored = {
+    "render": sizes | {"scene": "s", "results": [missing, other, pairs]},
     "env_steps": {"results": [steps]},
     "end_to_end": {"results": [training]},
     "growth": {"results": points},
   }
-  for name, fields in reports.items():
-    (tmp_path / f"{name}.json").write_text(json.dumps(MACHINE | fields))
-  report.write(tmp_path, doc)
+  for name, fields in stored.items():
+    report = MACHINE | {"benchmark": name} | fields
+    (tmp_path / f"{name}.json").write_text(json.dumps(report))
+  run = MACHINE | {"benchmark": "training", "results": [{"first_iteration_s": 90.0}]}
+  empty = {"report": {"results": []}, "status": "out of time"}
+  gpu = {"sections": {"training": {"report": run}, "late": empty}}
+  (tmp_path / "gpu.json").write_text(json.dumps(gpu))
+  performance.write(tmp_path, doc)
   text = doc.read_text()
-  assert text.count("as before") == len(report.SECTIONS) - len(reports)
-  assert "| PyBullet, TinyRenderer | 1 | 72x96 |  | missing: no module |  |  |" in text
+  assert text.count("as before") == len(names) - len(stored) - 1
+  assert "| 72x96 | MuJoCo, EGL | 3 |" in text
+  assert "| 72x96 | PyBullet, TinyRenderer | missing |" in text
   assert "| t | mjx | pixels | 4 | 50 (40 to 60) | 1,000 | 5 % |" in text
-  assert "| 60 % (3 %) | 40 % |" in text
-  assert "2 GFLOP/s and 1 GB/s" in text
+  assert "| t | mjx | pixels | 4 | 60 % (3 %) | 40 % |" in text
+  assert "commit abc, a machine, 2 cores" in text and "2 GFLOP/s, 1 GB/s" in text
   # Half of proportional from 1 to 4, proportional from there on.
   assert "| 4 | 200 (200 to 200) | 0.50 | 50 % |" in text
   assert "| 16 | 800 (800 to 800) | 1.00 | 50 % |" in text
+  assert "| first_iteration_s |\n| --- |\n| 90 |" in text
   for plot in ("growth", "rates"):
     assert (tmp_path / "images" / f"{plot}.png").stat().st_size > 1000

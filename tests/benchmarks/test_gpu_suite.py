@@ -1,72 +1,46 @@
-"""The GPU suite in small, on a CPU: its report, its budget, what fails in it."""
+"""The GPU suite in small, on a CPU: its report, its budget, failures in it."""
 
 from __future__ import annotations
 
+import importlib
 import json
+import time
 
-import gpu_sections
-import gpu_suite
 import pytest
 
-from apnpql_jax.tasks import task_names
+from benchmarks.gpu import suite
+
+SLOTS = ["speed.growth", "--quick", "--axes", "slots"]
 
 
-def run(tmp_path, *args: str) -> dict:
-  """The report of a quick run."""
-  out = tmp_path / "report.json"
-  gpu_suite.main(["--quick", "--jobs", "1", "--out", str(out), *args])
-  return json.loads(out.read_text())["sections"]
+def test_its_sections_are_benchmarks():
+  for args in suite.SECTIONS.values():
+    importlib.import_module(f"benchmarks.{args.split()[0]}")
+  assert list(suite.SECTIONS)[0] == "training from pixels"
 
 
-def test_its_tasks_and_sections_exist():
-  assert set(gpu_suite.TASKS) <= set(task_names())  # Not a task of your own.
-  known = {name.partition("/")[0] for name in gpu_suite.SECTIONS}
-  assert known == set(gpu_sections.SECTIONS)
-
-
-def test_figures_are_in_the_report(tmp_path):
-  section = run(tmp_path, "--sections", "device", "--budget", "300")["device"]
-  assert section["status"] == "done" and not section["missing"]
-  found = {result["what"]: result for result in section["results"]}
-  assert set(section["plan"]) < set(found)
-  assert found["copy"]["gib_per_s"] > 0 and found["copy"]["quiet"]
-  assert found["product float32"]["compile_s"] > 0
-  lines = list(gpu_suite.rows({"sections": {"device": section}}))
-  assert [line[1] for line in lines] == list(found)
+def test_sections_end_with_results_or_with_a_reason(tmp_path):
+  out = tmp_path / "gpu.json"
+  whole = suite.Suite(out, str(tmp_path), time.monotonic() + 300)
+  assert whole.run("growth", SLOTS).startswith("growth: done, 1 results")
+  (line,) = [whole.run("wrong", ["speed.growth", "--axes", "nothing"])]
+  assert "failed" in line and "invalid choice: 'nothing'" in line
+  late = suite.Suite(tmp_path / "late.json", str(tmp_path), time.monotonic())
+  assert late.run("growth", SLOTS) == "growth: out of time, 0 results []"
+  sections = json.loads(out.read_text())["sections"]
+  assert sections["growth"]["report"]["benchmark"] == "growth"
+  assert sections["growth"]["report"]["results"][0]["seconds"] > 0
+  assert sections["wrong"]["report"]["results"] == []
 
 
 @pytest.mark.slow
-def test_every_section_comes_to_its_end_on_a_cpu(tmp_path):
-  sections = run(tmp_path, "--budget", "1500", "--train", "5")
-  assert set(gpu_suite.SECTIONS) < set(sections)
-  for name in gpu_suite.SECTIONS:
-    assert sections[name]["status"] == "done" and not sections[name]["missing"], name
-  failed = [
-    line[1] for line in gpu_suite.rows({"sections": sections}) if "Error" in line[-1]
-  ]
-  assert set(failed) <= {"warp"}  # It may not be installed.
-  period = next(r for r in sections["engines"]["results"] if "finite" in r)
-  assert period["finite"] and period["qpos_differs"] < 1e-4
-
-
-def test_what_does_not_fit_into_the_budget_is_named(tmp_path):
-  sections = run(tmp_path, "--sections", "device", "engines", "--budget", "0")
-  assert sections["device"]["status"] == "skipped: no time was left"
-  assert sections["engines"]["status"] == "skipped: no time was left"
-
-
-def test_a_section_that_fails_or_is_late_keeps_its_place(tmp_path):
-  report = gpu_suite.Report(tmp_path / "report.json")
-  env = gpu_suite._environment(gpu_suite._arguments(["--quick"]), tmp_path)
-  settings = gpu_suite.QUICK | {"folder": str(tmp_path), "threads": 1}
-  running = [
-    gpu_suite.Running(name, settings, env, report)
-    for name in ("worlds/nothing", "device")
-  ]
-  running[1].finish(deadline=0.0)
-  running[0].finish(deadline=float("inf"))
-  sections = report.content["sections"]
-  assert sections["device"]["status"] == "stopped: its time was over"
-  assert sections["worlds/nothing"]["status"].startswith("failed: ")
-  lines = {line[0]: line[-1] for line in gpu_suite.rows(report.content)}
-  assert "nothing" in lines["worlds/nothing"]
+def test_every_section_ends_on_a_cpu(tmp_path, capsys):
+  out = tmp_path / "gpu.json"
+  suite.main(["--quick", "--out", str(out), "--budget", "3000"])
+  sections = json.loads(out.read_text())["sections"]
+  assert list(sections) == list(suite.SECTIONS)
+  for name, section in sections.items():
+    assert section["status"] == "done" and section["report"]["results"], name
+  training = sections["training from pixels"]["report"]["results"][0]
+  assert training["first_iteration_s"] > 0 and training["faults/updates"] == 0
+  assert capsys.readouterr().out.startswith("training from pixels: done, 1 results")

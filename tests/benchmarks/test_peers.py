@@ -1,28 +1,26 @@
-"""What the project is compared with does the same work; and how sides answer."""
+"""Peers do the same work as this project, and sides answer or fail clearly."""
 
 from __future__ import annotations
 
 import json
 
-from cures import cures
 import jax
 import mujoco
 from mujoco.mjx._src import scan, solver
 import numpy as np
-import peer_mujoco
-from peer_worlds import World
-import peers
 import pytest
-import sections
-import sides
-import urdf
 
+from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config.files import load_preset
 from apnpql_jax.sim import mjx_patches
 from apnpql_jax.tasks import make_task, task_names
+from benchmarks.common import noise
+from benchmarks.common.mjx_patching import patched
+from benchmarks.page import reports
+from benchmarks.peers import compare, mujoco_worlds, sides, urdf, worlds
+from benchmarks.peers.worlds import World
 
 CAMERAS = {"global": (72, 96), "wrist": (36, 64)}
-SIZES = {"task": "push_plate", "processes": 2, "gymnasium": False}
 
 
 def random_world(model: mujoco.MjModel, rows: int) -> World:
@@ -46,7 +44,7 @@ def random_world(model: mujoco.MjModel, rows: int) -> World:
 @pytest.mark.parametrize("name", task_names())
 def test_pybullet_has_every_body_where_mujoco_has_it(name):
   pytest.importorskip("pybullet")
-  from peer_pybullet import BulletEnv
+  from benchmarks.peers.pybullet_worlds import BulletEnv
 
   world = random_world(make_task(name).scene.model, rows=8)
   env, data = BulletEnv(world), mujoco.MjData(world.model)
@@ -63,7 +61,7 @@ def test_pybullet_has_every_body_where_mujoco_has_it(name):
 
 def test_pybullet_moves_the_arm_as_commanded(task):
   pytest.importorskip("pybullet")
-  from peer_pybullet import BulletEnv
+  from benchmarks.peers.pybullet_worlds import BulletEnv
 
   world = random_world(task.scene.model, rows=1)
   world.qpos[0] = task.scene.keyframe("neutral")
@@ -88,7 +86,7 @@ def test_mujoco_peer_is_the_native_engine(task, engines, resets):
     CAMERAS,
   )
   rng, state = np.random.default_rng(1), resets
-  envs = [peer_mujoco.MujocoEnv(world) for _ in range(rows)]
+  envs = [mujoco_worlds.MujocoEnv(world) for _ in range(rows)]
   for row, env in enumerate(envs):
     env.reset(row)
   for _ in range(5):
@@ -107,7 +105,7 @@ def test_stock_mjx_is_stock_while_it_is_traced():
   mjx_patches.patch_mjx()
   ours = scan.body_tree, solver._update_gradient
   stock = mjx_patches._stock_body_tree, mjx_patches._stock_update_gradient
-  with cures(barrier=False, cones=False):
+  with patched(barrier=False, cones=False):
     assert (scan.body_tree, solver._update_gradient) == stock
   assert (scan.body_tree, solver._update_gradient) == ours != stock
 
@@ -121,67 +119,53 @@ def test_urdf_refuses_what_it_cannot_express():
     urdf.write(model, 1)
 
 
-def test_a_side_answers_and_says_what_is_wrong():
-  with sides.Side("peer_mujoco.py", SIZES, limit_s=120) as side:
+@pytest.fixture
+def settings(tmp_path) -> dict:
+  """Settings of a side with MuJoCo's worlds."""
+  worlds.export("push_plate", CAMERAS, tmp_path)
+  return {"folder": str(tmp_path), "gymnasium": False}
+
+
+def test_a_side_adds_up_its_processes_and_names_errors(settings):
+  with sides.Side("mujoco_worlds", settings, count=2, limit_s=120) as side:
     assert side.rate("physics", 0.2) > 0
     with pytest.raises(sides.SideFailed, match="KeyError: 'nothing'"):
       side.rate("nothing", 0.2)
     assert side.rate("physics", 0.2) > 0
 
 
-def test_a_side_that_cannot_start_or_is_late_is_left_out():
-  with pytest.raises(sides.SideFailed, match="can't open file"):
-    sides.Side("peer_nothing.py", SIZES, limit_s=60)
+def test_a_side_that_cannot_start_or_is_late_fails(settings):
+  with pytest.raises(sides.SideFailed, match="No module named 'benchmarks.peers.no'"):
+    sides.Side("no", settings, limit_s=60)
   with pytest.raises(sides.SideFailed, match="no answer within 0 s"):
-    sides.Side("peer_mujoco.py", SIZES, limit_s=0.05)
+    sides.Side("mujoco_worlds", settings, limit_s=0.05)
 
 
 @pytest.mark.slow
 def test_ratios_are_reported_or_why_there_are_none(capsys):
-  peers.main(["--quick", "--json", "--peers", "mujoco", "brax"])
+  compare.main(["--quick", "--json", "--peers", "mujoco", "gymnasium"])
   report = json.loads(capsys.readouterr().out)
   physics = next(
-    r for r in report["results"] if r.get("rate") == peers.RATES["physics"]
+    r for r in report["results"] if r.get("rate") == compare.RATES["physics"]
   )
   (ours,), (theirs,) = physics["ours_per_s"], physics["theirs_per_s"]
   assert physics["ratio"] == pytest.approx(ours / theirs) and ours > 0
   for result in report["results"]:
     assert ("missing" in result) != ("ratio" in result)
-  assert physics["peer"] in sections.peers(report)
+  assert physics["peer"] in reports.block(report)
 
 
-@pytest.fixture(scope="module")
-def parameters() -> int:
-  """Number of parameters of push_plate's networks."""
-  from apnpql_jax.agents.learner import make_agent
-  from apnpql_jax.testing import random_batch
-
-  agent = make_agent(load_preset("push_plate").agent)
-  example = random_batch(0, 1, pixels=True).observation_tm1
-  params = jax.eval_shape(agent.init, jax.random.key(0), example).params
-  return sum(x.size for x in jax.tree.leaves(params))
-
-
-def test_torch_learns_with_networks_of_the_same_size(parameters):
+def test_torch_learns_with_networks_of_the_same_size():
   torch = pytest.importorskip("torch")
-  import peer_torch
+  from benchmarks.peers import torch_learner
 
-  config = load_preset("push_plate").agent
-  learner = peer_torch.Learner(config, "cpu")
-  assert sum(x.numel() for x in learner.online.parameters()) == parameters
-  batch = peer_torch.random_batch(4, "cpu")
+  config = load_preset("push_plate")
+  agent, example = make_agent(config.agent), noise.transitions(config).observation_tm1
+  params = jax.eval_shape(agent.init, jax.random.key(0), example).params
+  learner = torch_learner.Learner(config.agent, "cpu")
+  count = sum(x.size for x in jax.tree.leaves(params))
+  assert sum(x.numel() for x in learner.online.parameters()) == count
+  batch = torch_learner.random_batch(4, "cpu")
   losses = [learner.update(batch) for _ in range(10)]
   assert np.isfinite(losses).all() and losses[-1] < losses[0]
   assert all(torch.isfinite(x).all() for x in learner.target.parameters())
-
-
-def test_brax_updates_all_that_it_trains():
-  pytest.importorskip("brax")
-  import peer_brax
-
-  config = load_preset("push_plate").agent
-  state, update = peer_brax.make_update(config, peer_brax.random_batch(4))
-  after = update(state, jax.random.key(0))
-  assert all(np.isfinite(x).all() for x in jax.tree.leaves(after[0]))
-  moved = jax.tree.map(lambda x, y: bool((x != y).any()), state[0], after[0])
-  assert all(jax.tree.leaves(moved))

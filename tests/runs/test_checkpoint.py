@@ -24,7 +24,7 @@ import pytest
 
 from apnpql_jax.config.files import config_to_json
 from apnpql_jax.config.schema import AgentConfig, TrainConfig
-from apnpql_jax.errors import ConfigError, UserError
+from apnpql_jax.errors import UserError
 from apnpql_jax.runs import checkpoint_reader, checkpoint_record
 from apnpql_jax.runs.checkpoint_writer import CheckpointWriter, SaveError
 from apnpql_jax.training import resume

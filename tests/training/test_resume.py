@@ -115,7 +115,7 @@ def test_a_run_killed_at_random_times_ends_like_an_undisturbed_one(tmp_path, kil
 )
 def test_a_run_resumed_in_a_new_process_equals_an_undisturbed_one(backend, obs):
   """Covers other engines and observations, compiled like any run."""
-  command = [sys.executable, str(testing.ROOT / "benchmarks" / "resume.py")]
+  command = [sys.executable, "-m", "benchmarks.reliability.resume"]
   command += ["--backend", backend, "--obs", obs]
   env = os.environ | {"PYTHONPATH": str(testing.ROOT)}
   done = subprocess.run(command, env=env, capture_output=True, text=True)

@@ -22,7 +22,6 @@ from typing import Any
 from hand_made import SLOW_MJX
 import jax
 import jax.numpy as jnp
-import messages
 import numpy as np
 import pytest
 
@@ -41,6 +40,7 @@ from apnpql_jax.training.iteration import make_iteration
 from apnpql_jax.training.placement import shardings
 from apnpql_jax.training.rollout import agent_policy, rollout
 from apnpql_jax.training.state import TrainState, example_state, initial_state
+from benchmarks.speed import messages
 
 DEVICES = 4
 ITERATIONS = 3

@@ -1,0 +1,1 @@
+"""Measurements of speed, quality and reliability; README.md lists them."""

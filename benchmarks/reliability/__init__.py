@@ -1,0 +1,1 @@
+"""Training runs that are interrupted, damaged and resumed."""
