@@ -14,6 +14,7 @@ from typing import Any
 
 import jax
 
+from apnpql_jax import devices
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.envs.env import make_env
