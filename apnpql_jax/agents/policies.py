@@ -1,4 +1,4 @@
-"""Where actions come from and how they are weighed (Table I, column "policy")."""
+"""Policies as weighted candidate actions (Table I, column "policy")."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from apnpql_jax.types import ARM_DOF, Array
 CEM_ITERATIONS = 2
 CEM_SAMPLES = 64
 CEM_ELITES = 6
-"""Of the cross-entropy method, as in QT-Opt (Kalashnikov 2018)."""
+"""Settings of the cross-entropy method, as in QT-Opt (Kalashnikov 2018)."""
 
 CEM_MIN_STD = 0.01
-"""Floor of the deviation of the elites, rad/s, so that the next draw still differs."""
+"""Floor of the elites' standard deviation, rad/s, so that the next draws differ."""
 
 
 class Candidates(struct.PyTreeNode):
@@ -31,7 +31,7 @@ class Candidates(struct.PyTreeNode):
   outputs: Array  # f32[S, *b, n]: of the value head
   q_values: Array  # f32[S, *b]
   weights: Array  # f32[S, *b]: sum to one over S
-  base: ActionDistribution  # [*b]: the policy is base exp(tilt Q), normalised
+  base: ActionDistribution  # [*b]: the policy is base exp(tilt Q), normalized
   tilt: Array  # f32[*b]: 1 / alpha, or zero where the policy is ``base`` itself
 
   @property
@@ -46,9 +46,12 @@ class Candidates(struct.PyTreeNode):
     return jnp.sum(self.weights * surprise, axis=0)
 
   def log_prob(self, actions: Array, q_values: Array) -> Array:
-    """Log density of actions f32[T, *b, 7] with values f32[T, *b]: f32[T, *b].
+    """Computes the log density of actions f32[T, *b, 7] with values f32[T, *b].
 
-    Of q it is an estimate: log b + Q / alpha - log mean_i exp(Q_i / alpha).
+    For q this is an estimate: log b + Q / alpha - log mean_i exp(Q_i / alpha).
+
+    Returns:
+      f32[T, *b].
     """
     tilt = self.tilt[None]
     log_sum = jax.nn.logsumexp(tilt * self.q_values, axis=0, keepdims=True)
@@ -57,7 +60,7 @@ class Candidates(struct.PyTreeNode):
 
 
 def clip_action(actions: Array) -> Array:
-  """Limits joint velocities to [-1, 1] rad/s; the gripper, in {0, 1}, is unchanged."""
+  """Clips joint velocities to [-1, 1] rad/s; leaves the gripper in {0, 1} unchanged."""
   return jnp.clip(actions, -1.0, 1.0)
 
 
@@ -69,20 +72,20 @@ def non_parametric(
   num_samples: int,
   greedy: bool = False,
 ) -> Candidates:
-  """q = b exp(Q / alpha) / Z by self-normalised importance sampling (paper Eq. 6).
+  """Samples q = b exp(Q / alpha) / Z by self-normalized importance sampling (Eq. 6).
 
   Args:
     heads: the networks at the states.
-    prior: the regulariser b at the same states.
+    prior: the regularizer b at the same states.
     key: random key.
     num_samples: candidates S per state.
-    greedy: all weight on the one of highest value.
+    greedy: put all weight on the candidate with the highest value.
 
   Returns:
-    Candidates drawn from ``prior`` with weights softmax(Q / alpha); no gradients.
+    Candidates drawn from ``prior`` with weights softmax(Q / alpha), without gradient.
   """
   heads, prior = heads.frozen(), jax.lax.stop_gradient(prior)
-  samples = prior.sample(key, num_samples)
+  samples = prior.sample(seed=key, sample_shape=num_samples)
   actions, outputs, q_values = _evaluate(heads, samples)
   alpha = heads.alpha()
   weights = boltzmann.importance_weights(q_values, alpha)
@@ -99,23 +102,25 @@ def parametric(
   num_samples: int,
   greedy: bool = False,
 ) -> Candidates:
-  """pi_psi: half as many draws of the arm, each with the gripper open and closed.
+  """Samples the arm from pi_psi and pairs each draw with both gripper commands.
 
-  The gripper is summed over exactly: the two share the weight of their draw as pi
-  has it. Gradients reach psi through draws and weights, and nothing else.
+  The two candidates of a draw share its weight in proportion to their density under
+  pi, so the sum over the gripper is exact. Gradients reach only psi, through draws and
+  weights.
 
   Args:
     heads: the networks at the states.
-    prior: not needed.
+    prior: unused.
     key: random key.
     num_samples: candidates S per state, rounded down to an even number.
-    greedy: the mean in place of draws, all weight on the likelier gripper.
+    greedy: use the mean instead of draws and put all weight on the likelier gripper
+      command.
   """
   del prior
   policy = heads.policy()
-  drawn = policy.sample(key, 1 if greedy else num_samples // 2)
+  drawn = policy.sample(seed=key, sample_shape=1 if greedy else num_samples // 2)
   if greedy:
-    drawn = drawn.at[..., :ARM_DOF].set(policy.mean[None, ..., 0, :])
+    drawn = drawn.at[..., :ARM_DOF].set(policy.loc[None, ..., 0, :])
   both = jnp.stack([drawn.at[..., -1].set(gripper) for gripper in (0.0, 1.0)])
   samples = both.reshape(-1, *drawn.shape[1:])
   actions, outputs, q_values = _evaluate(heads.frozen(), samples)
@@ -135,25 +140,25 @@ def cem(
   num_samples: int,
   greedy: bool = False,
 ) -> Candidates:
-  """The best action that the cross-entropy method finds (QT-Opt), from draws of b.
+  """Finds the best action by the cross-entropy method (QT-Opt), starting from b.
 
   Args:
     heads: the networks at the states.
-    prior: the regulariser b: the first draw is its.
+    prior: the regularizer b, the source of the first draw.
     key: random key.
-    num_samples: not needed; ``CEM_SAMPLES`` belong to the method.
-    greedy: not needed; the method is.
+    num_samples: unused; the method draws ``CEM_SAMPLES``.
+    greedy: unused; the method is greedy.
 
   Returns:
-    The last draw, all weight on its best action; no gradients.
+    The last draw with all weight on its best action, without gradient.
   """
   del num_samples, greedy
   heads, base = heads.frozen(), jax.lax.stop_gradient(prior)
   *keys, last = jax.random.split(key, CEM_ITERATIONS)
   for k in keys:
-    samples = base.sample(k, CEM_SAMPLES)
+    samples = base.sample(seed=k, sample_shape=CEM_SAMPLES)
     base = _refit(samples, _evaluate(heads, samples)[2], heads.config.policy_min_prob)
-  samples = base.sample(last, CEM_SAMPLES)
+  samples = base.sample(seed=last, sample_shape=CEM_SAMPLES)
   actions, outputs, q_values = _evaluate(heads, samples)
   weights = _all_on_the_highest(q_values)
   tilt = jnp.zeros(q_values.shape[1:])
@@ -161,19 +166,19 @@ def cem(
 
 
 def _evaluate(heads: Heads, samples: Array) -> tuple[Array, Array, Array]:
-  """Clipped actions, outputs of the value head, Q, each [S, *b, ...]."""
+  """Returns clipped actions, outputs of the value head and Q, each [S, *b, ...]."""
   actions = clip_action(samples)
   outputs = heads.z(actions)
   return actions, outputs, heads.networks.evaluation.value(outputs)
 
 
 def _all_on_the_highest(x: Array) -> Array:
-  """Weights f32[S, *b] that pick the highest of f32[S, *b]."""
+  """Returns weights f32[S, *b] that select the highest of f32[S, *b]."""
   return jax.nn.one_hot(jnp.argmax(x, axis=0), x.shape[0], axis=0, dtype=x.dtype)
 
 
 def _refit(samples: Array, q_values: Array, min_prob: float) -> GripperGMM:
-  """One diagonal Gaussian, and a probability to close, of the best few of S draws."""
+  """Fits a diagonal Gaussian and a gripper probability to the best few of S draws."""
   elites = jax.lax.top_k(jnp.moveaxis(q_values, 0, -1), CEM_ELITES)[1]
   elites = jnp.moveaxis(elites, -1, 0)[..., None]
   best = clip_action(jnp.take_along_axis(samples, elites, axis=0))
@@ -184,7 +189,7 @@ def _refit(samples: Array, q_values: Array, min_prob: float) -> GripperGMM:
   std = jnp.maximum(std[..., None, :-1], CEM_MIN_STD)
   return GripperGMM(
     logits=jnp.zeros((*close.shape, 1)),
-    mean=mean[..., None, :-1],
+    loc=mean[..., None, :-1],
     scale_tril=scale.at[..., joint, joint].set(std),
     gripper_logits=(jnp.log(close) - jnp.log1p(-close))[..., None],
   )
