@@ -1,4 +1,4 @@
-"""Mixtures from the outputs of their heads, in limits they can leave again."""
+"""Mixtures from the outputs of network heads, clipped to limits."""
 
 from __future__ import annotations
 
@@ -23,32 +23,32 @@ def mixture_from_outputs(
   min_prob: float,
   diagonal: bool = False,
 ) -> GripperGMM:
-  """Turns raw outputs of a head into a mixture, around the given means or its own.
+  """Converts raw outputs of a head to a mixture around given means or its own.
 
   Each row of a Cholesky factor is a direction times the standard deviation of that
-  joint. The deviation has a floor and a limit: as the means are fixed, a value that
-  merely rises towards one side can make the M-step widen the component, again and
-  again, until most candidates are far from every action primitive and their values
-  are guesses. Components and gripper commands keep a smallest probability, for what
-  the prior no longer proposes, q can neither try nor find better; an entropy floor
-  cannot see to that, as a wide Gaussian makes up for a gripper that never opens.
+  joint. The deviation has a floor and a limit. Because the means are fixed, a value
+  that rises towards one side can make every M-step widen the component, until most
+  candidates are far from every action primitive and their values are guesses.
+  Components and gripper commands keep a minimum probability, because q cannot evaluate
+  actions that the prior no longer proposes. An entropy floor does not ensure this: a
+  wide Gaussian compensates for a gripper that never opens.
 
-  The limits are one-way clips and not squashing functions: in the first updates the
-  values are noise, Adam drives the outputs far to one side at a speed that does not
-  depend on the gradient's size, and from there a sigmoid or softmax never returns.
+  The limits are one-way clips, not squashing functions. In the first updates the values
+  are noise, and Adam drives the outputs far to one side at a speed that does not depend
+  on the gradient's size. A sigmoid or softmax never returns from there.
 
   Args:
     outputs: f32[*b, K * mixture_size(own_mean=primitives is None)].
-    primitives: f32[*b, K, 7], means in rad/s, to be kept in the action box, and logits
-      of closing the gripper, to which an output is added; None if the outputs hold the
+    primitives: f32[*b, K, 7], means in rad/s, clipped to the action box, and logits of
+      closing the gripper, to which an output is added; None if the outputs contain the
       means.
     num: components K.
     min_std: floor of the standard deviation of each joint, rad/s.
-    initial_std: the standard deviation where the outputs are zero, rad/s.
+    initial_std: standard deviation for outputs of zero, rad/s.
     max_std: limit of the standard deviation of each joint, rad/s.
-    min_prob: weight of a component that stands at the floor while one of the others
-      stands at the limit; smallest probability of a gripper command.
-    diagonal: leave the outputs below the diagonal of the Cholesky factor unread.
+    min_prob: weight of a component at its floor while one of the others is at its
+      limit; smallest probability of a gripper command.
+    diagonal: ignore the outputs below the diagonal of the Cholesky factor.
   """
   dim = ARM_DOF
   outputs = outputs.reshape(*outputs.shape[:-1], num, -1)
@@ -70,14 +70,14 @@ def mixture_from_outputs(
   logits = one_way_clip(logits[..., 0], -widest, widest)
   return GripperGMM(
     logits=jax.nn.log_softmax(logits),
-    mean=mean,
+    loc=mean,
     scale_tril=_scale_tril(log_std, jnp.zeros_like(below) if diagonal else below),
     gripper_logits=one_way_clip(close + gripper[..., 0], -surest, surest),
   )
 
 
 def _scale_tril(log_std: Array, below: Array) -> Array:
-  """Cholesky factors f32[*b, K, D, D] whose rows have the length exp(log_std)."""
+  """Returns Cholesky factors f32[*b, K, D, D] with rows of length exp(log_std)."""
   dim = log_std.shape[-1]
   rows, columns = jnp.tril_indices(dim, k=-1)
   direction = jnp.broadcast_to(jnp.eye(dim, dtype=log_std.dtype), (*log_std.shape, dim))
@@ -87,13 +87,13 @@ def _scale_tril(log_std: Array, below: Array) -> Array:
 
 
 def mixture_size(*, own_mean: bool) -> int:
-  """Outputs per component: mean if its own, Cholesky factor, weight, gripper."""
+  """Counts outputs per component: own mean, Cholesky factor, weight and gripper."""
   return ARM_DOF * own_mean + ARM_DOF * (ARM_DOF + 1) // 2 + 2
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1, 2))
 def one_way_clip(x: Array, low: float, high: float) -> Array:
-  """``clip`` with a gradient that leads back: what leads further out is dropped.
+  """Clips, with a gradient that only leads back: outward gradients are dropped.
 
   Args:
     x: f32[*b].

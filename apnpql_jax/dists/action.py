@@ -1,64 +1,71 @@
-"""What every distribution over actions can do, and the broadest one on the box."""
+"""Distributions over actions: their interface and the uniform one on the action box.
+
+Shapes in annotations are jaxtyping's and are not checked at run time: ``*b`` are batch
+axes, ``*sb`` sample axes followed by batch axes, ``d`` the continuous dimensions.
+"""
 
 from __future__ import annotations
 
+import abc
 import math
-from typing import Protocol
 
+import distrax
 from flax import struct
-import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
 
-Array = jax.Array
 
+class ActionDistribution(
+  distrax.Distribution[Array, tuple[int, ...], jnp.dtype], struct.PyTreeNode
+):
+  """Distribution over actions f32[D + 1] with the gripper command in {0, 1} last.
 
-class ActionDistribution(Protocol):
-  """Distribution over actions f32[D + 1], the gripper in {0, 1} last, batch ``*b``.
-
-  Densities are with respect to Lebesgue x counting measure, and so are entropies.
+  Densities and entropies refer to the product of Lebesgue and counting measure.
   """
 
-  def sample(self, key: Array, num: int) -> Array:
-    """Draws f32[num, *b, D + 1]."""
-    ...
+  @abc.abstractmethod
+  def log_prob(self, value: Float[Array, "*sb d+1"]) -> Float[Array, "*sb"]:
+    """Returns the log density of actions that need not lie in the action box."""
 
-  def log_prob(self, actions: Array) -> Array:
-    """Log density: f32[S, *b, D + 1] -> f32[S, *b]."""
-    ...
-
-  def entropy_bound(self) -> Array:
-    """The entropy in nats or a lower bound of it, f32[*b]."""
-    ...
+  @abc.abstractmethod
+  def entropy_bound(self) -> Float[Array, "*b"]:
+    """Returns a lower bound of the entropy in nats."""
 
 
-class UniformBox(struct.PyTreeNode):
-  """Uniform over [-1, 1]^D x {0, 1}: what regularizes plain entropy maximization.
+class UniformBox(ActionDistribution):
+  """Uniform distribution over [-1, 1]^D x {0, 1}, the regularizer of plain entropy.
 
-  The density is the same everywhere, beyond the box too: an action drawn out there
-  is clipped to the box before anything sees it. KL(pi || uniform) is then
-  log_volume - H(pi).
+  KL(pi || uniform) is log_volume - H(pi). The density is the same outside the box,
+  because actions are clipped to the box before they are used.
   """
 
   batch: tuple[int, ...] = struct.field(pytree_node=False)
   dim: int = struct.field(pytree_node=False)
 
   @property
+  def event_shape(self) -> tuple[int, ...]:
+    """Shape of one action."""
+    return (self.dim + 1,)
+
+  @property
   def log_volume(self) -> float:
-    """Entropy in nats: D log 2 for the arm, log 2 for the gripper."""
+    """Entropy in nats: D log 2 for the arm and log 2 for the gripper."""
     return (self.dim + 1) * math.log(2.0)
 
-  def sample(self, key: Array, num: int) -> Array:
-    """Draws f32[num, *b, D + 1]."""
-    draws = jax.random.uniform(
-      key, (num, *self.batch, self.dim + 1), jnp.float32, minval=-1.0
-    )
+  def _sample_n(self, key: PRNGKeyArray, n: int) -> Float[Array, "n *b d+1"]:
+    cube = distrax.Uniform(jnp.full((*self.batch, *self.event_shape), -1.0), 1.0)
+    draws = cube.sample(seed=key, sample_shape=n)
     gripper = (draws[..., -1:] > 0.0).astype(draws.dtype)
     return jnp.concatenate([draws[..., :-1], gripper], axis=-1)
 
-  def log_prob(self, actions: Array) -> Array:
-    """-log_volume, f32[S, *b]."""
-    return jnp.full(actions.shape[:-1], -self.log_volume, actions.dtype)
+  def log_prob(self, value: Float[Array, "*sb d+1"]) -> Float[Array, "*sb"]:
+    """Returns -log_volume for every action, also for those outside the box."""
+    return jnp.full(value.shape[:-1], -self.log_volume, value.dtype)
 
-  def entropy_bound(self) -> Array:
-    """log_volume, exactly: f32[*b]."""
+  def entropy(self) -> Float[Array, "*b"]:
+    """Returns log_volume for every batch element."""
     return jnp.full(self.batch, self.log_volume, jnp.float32)
+
+  def entropy_bound(self) -> Float[Array, "*b"]:
+    """Returns the entropy, which is known exactly."""
+    return self.entropy()

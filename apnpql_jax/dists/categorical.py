@@ -4,36 +4,41 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 import numpy as np
 
-Array = jax.Array
 
-
-def support(*, v_min: float, v_max: float, num_atoms: int) -> Array:
-  """The returns the atoms stand for, f32[n], evenly spaced with both ends."""
+def support(*, v_min: float, v_max: float, num_atoms: int) -> Float[Array, " n"]:
+  """Returns the atoms: evenly spaced returns that include both ends."""
   return jnp.linspace(v_min, v_max, num_atoms, dtype=jnp.float32)
 
 
-def mean(probs: Array, atoms: Array) -> Array:
-  """Expected return of f32[*b, n] probabilities on f32[n] atoms: f32[*b]."""
+def mean(probs: Float[Array, "*b n"], atoms: Float[Array, " n"]) -> Float[Array, "*b"]:
+  """Returns the expected return."""
   return probs @ atoms
 
 
-def project(probs: Array, reward: Array, discount: Array, atoms: Array) -> Array:
+def project(
+  probs: Float[Array, "*b n"],
+  reward: Float[Array, "*b"],
+  discount: Float[Array, "*b"],
+  atoms: Float[Array, " n"],
+) -> Float[Array, "*b n"]:
   """Projects the distribution of ``reward + discount * z`` back onto the atoms.
 
-  The projection is linear in ``probs``. So the expectation over candidate actions
-  is taken first, and one projection per state is enough (paper Eq. 8, right side).
+  The projection is linear in ``probs``. Averaging over candidate actions first
+  therefore leaves one projection per state (paper Eq. 8, right side).
 
   Args:
-    probs: f32[*b, n] distribution of the return z at the bootstrap state, already
-      averaged over actions.
-    reward: f32[*b].
-    discount: f32[*b], zero where the episode terminated.
-    atoms: f32[n], evenly spaced and increasing.
+    probs: distribution of the return z at the bootstrap state, already averaged over
+      actions.
+    reward: reward per state.
+    discount: discount per state, zero where the episode terminated.
+    atoms: support, evenly spaced and increasing.
 
   Returns:
-    f32[*b, n], same mass as ``probs``; returns beyond the support go to its ends.
+    Probabilities with the same mass as ``probs``; returns beyond the support count at
+    its ends.
   """
   shape = (1,) * reward.ndim + atoms.shape
   moved = reward[..., None] + discount[..., None] * atoms.reshape(shape)
@@ -44,16 +49,23 @@ def project(probs: Array, reward: Array, discount: Array, atoms: Array) -> Array
   return jnp.sum(share * probs[..., None, :], axis=-1)
 
 
-def cross_entropy(probs: Array, logits: Array) -> Array:
-  """-sum_j p_j log softmax(logits)_j over the last axis: f32[*b, n] -> f32[*b]."""
+def cross_entropy(
+  probs: Float[Array, "*b n"], logits: Float[Array, "*b n"]
+) -> Float[Array, "*b"]:
+  """Returns -sum_j p_j log softmax(logits)_j."""
   return -jnp.sum(probs * jax.nn.log_softmax(logits), axis=-1)
 
 
-def broadest_logits(expected: float, atoms: np.ndarray) -> np.ndarray:
-  """Logits f32[n] of the maximum-entropy distribution with a given mean.
+def broadest_logits(
+  expected: float, atoms: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
+  """Returns logits of the maximum-entropy distribution with a given mean.
 
-  They are linear in the atoms (an exponential family); the slope is found by
-  bisection. ``expected`` must lie strictly between the ends of ``atoms``.
+  The logits are linear in the atoms (an exponential family); bisection finds the slope.
+
+  Args:
+    expected: mean, strictly between the ends of ``atoms``.
+    atoms: support, evenly spaced and increasing.
   """
   unit = (atoms - atoms[0]) / (atoms[-1] - atoms[0])
   goal = (expected - atoms[0]) / (atoms[-1] - atoms[0])

@@ -1,116 +1,133 @@
-"""A mixture over arm velocities and a gripper command: priors, parametric policies.
+"""Gaussian mixtures over arm velocities with a gripper command per component.
 
-Each component is a full-covariance Gaussian over the continuous part of an action
-times a Bernoulli over the gripper (paper Sec. IV-A). The density is therefore taken
-with respect to Lebesgue x counting measure, and so is the entropy.
+Behavior priors and parametric policies are such mixtures. Each component is a
+full-covariance Gaussian over the continuous part of an action times a Bernoulli over
+the gripper (paper Sec. IV-A). Shapes are written as in ``action``, with ``k`` for the
+components.
 
-The triangular systems are unrolled in plain array operations: batched LAPACK calls
-on thousands of 6x6 matrices are slow on XLA:CPU and can deadlock there.
+Samples and densities are written out in plain array operations. distrax's samplers
+draw noise for every component although only one is used. Its triangular normal makes
+batched LAPACK calls, which are slow for thousands of 6x6 matrices on XLA:CPU and can
+deadlock there.
 """
 
 from __future__ import annotations
 
 import math
 
-from flax import struct
+import distrax
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
 
-Array = jax.Array
+from apnpql_jax.dists.action import ActionDistribution
 
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
-class GripperGMM(struct.PyTreeNode):
-  """Mixture of K components over (D continuous dimensions, one binary gripper).
+class GripperGMM(ActionDistribution):
+  """Mixture of K components over D continuous dimensions and one binary gripper."""
 
-  An action is ``f32[D + 1]``, the gripper in {0, 1} last. ``*b`` are batch axes.
-  """
+  logits: Float[Array, "*b k"]
+  """Log weights, not necessarily normalized."""
 
-  logits: Array  # f32[*b, K]: unnormalized log weights
-  mean: Array  # f32[*b, K, D]
-  scale_tril: Array  # f32[*b, K, D, D]: lower Cholesky factor, positive diagonal
-  gripper_logits: Array  # f32[*b, K]: log odds of gripper = 1
+  loc: Float[Array, "*b k d"]
+  """Means of the continuous part."""
 
-  def sample(self, key: Array, num: int) -> Array:
-    """Draws actions; the continuous part is not clipped.
+  scale_tril: Float[Array, "*b k d d"]
+  """Lower Cholesky factors of the covariances, with positive diagonals."""
 
-    Args:
-      key: random key.
-      num: samples S per batch element.
+  gripper_logits: Float[Array, "*b k"]
+  """Log odds of gripper = 1."""
 
-    Returns:
-      f32[S, *b, D + 1].
-    """
+  @property
+  def event_shape(self) -> tuple[int, ...]:
+    """Shape of one action."""
+    return (self.loc.shape[-1] + 1,)
+
+  @property
+  def choice(self) -> distrax.Categorical:
+    """Distribution of the component."""
+    return distrax.Categorical(logits=self.logits)
+
+  @property
+  def gripper(self) -> distrax.Bernoulli:
+    """Distribution of the gripper command, given the component."""
+    return distrax.Bernoulli(logits=self.gripper_logits)
+
+  def _sample_n(self, key: PRNGKeyArray, n: int) -> Float[Array, "n *b d+1"]:
     key_arm, key_choice = jax.random.split(key)
-    batch, dim, dtype = self.mean.shape[:-2], self.mean.shape[-1], self.mean.dtype
-    noise = jax.random.normal(key_arm, (num, *batch, dim), dtype)
-    choice = jax.random.uniform(key_choice, (2, num, *batch), dtype)
+    batch, dim, dtype = self.loc.shape[:-2], self.loc.shape[-1], self.loc.dtype
+    noise = jax.random.normal(key_arm, (n, *batch, dim), dtype)
+    uniform = jax.random.uniform(key_choice, (2, n, *batch), dtype)
+    # Choose components by inverting the cumulative distribution.
     above = jnp.cumsum(jax.nn.softmax(self.logits), axis=-1)
-    component = jnp.sum(choice[0, ..., None] >= above[None, ..., :-1], axis=-1)
+    component = jnp.sum(uniform[0, ..., None] >= above[None, ..., :-1], axis=-1)
     chosen = jax.nn.one_hot(component, self.logits.shape[-1], dtype=dtype)
-    # Moving each draw by every component and then choosing beats gathering a 6x6
-    # factor per draw: K is small, and this is one batched matrix product.
-    arm = jnp.einsum("...kij,s...j->s...ki", self.scale_tril, noise) + self.mean[None]
+    # Transform each draw by every component, then choose: with few components, one
+    # batched matrix product is faster than gathering a 6x6 factor per draw.
+    arm = jnp.einsum("...kij,s...j->s...ki", self.scale_tril, noise) + self.loc[None]
     arm = jnp.sum(chosen[..., None] * arm, axis=-2)
-    probability = jnp.sum(chosen * jax.nn.sigmoid(self.gripper_logits)[None], axis=-1)
-    gripper = (choice[1] < probability).astype(dtype)
+    probability = jnp.sum(chosen * jnp.asarray(self.gripper.probs)[None], axis=-1)
+    gripper = (uniform[1] < probability).astype(dtype)
     return jnp.concatenate([arm, gripper[..., None]], axis=-1)
 
-  def log_prob(self, actions: Array) -> Array:
-    """Log density of unclipped actions.
-
-    Args:
-      actions: f32[S, *b, D + 1], gripper in {0, 1} last.
-
-    Returns:
-      f32[S, *b].
-    """
-    arm, gripper = actions[..., :-1], actions[..., -1]
+  def log_prob(self, value: Float[Array, "*sb d+1"]) -> Float[Array, "*sb"]:
+    """Returns the log density of unclipped actions."""
+    arm, gripper = value[..., :-1], value[..., -1]
     dim = arm.shape[-1]
-    # The factor is inverted once per component, not solved once per sample.
+    lead = (None,) * (value.ndim - self.logits.ndim)  # Adds the sample axes.
+    # Invert the factor once per component instead of solving once per sample.
     whitener = _invert_lower(self.scale_tril)
-    difference = arm[..., None, :] - self.mean[None]
-    white = jnp.einsum("...kij,s...kj->s...ki", whitener, difference)
+    difference = arm[..., None, :] - self.loc[lead]
+    white = jnp.einsum("...kij,...kj->...ki", whitener, difference)
     constant = -_half_log_det(self.scale_tril) - 0.5 * dim * _LOG_2PI
-    gaussian = constant[None] - 0.5 * jnp.sum(jnp.square(white), axis=-1)
-    odds = self.gripper_logits[None]
+    gaussian = constant[lead] - 0.5 * jnp.sum(jnp.square(white), axis=-1)
+    odds = self.gripper_logits[lead]
     bernoulli = gripper[..., None] * odds - jax.nn.softplus(odds)
-    log_weights = jax.nn.log_softmax(self.logits)[None]
+    log_weights = jnp.asarray(self.choice.logits)[lead]
     return jax.nn.logsumexp(log_weights + gaussian + bernoulli, axis=-1)
 
-  def component_entropy(self) -> Array:
-    """Entropy of each component in nats, f32[*b, K]: Gaussian plus Bernoulli."""
-    dim = self.mean.shape[-1]
+  def entropy(self) -> Float[Array, "*b"]:
+    """Returns the entropy of a single component in nats.
+
+    Raises:
+      NotImplementedError: for several components; there is no closed form.
+    """
+    if self.logits.shape[-1] > 1:
+      raise NotImplementedError("entropy of several components; see entropy_bound")
+    return self.component_entropy()[..., 0]
+
+  def component_entropy(self) -> Float[Array, "*b k"]:
+    """Returns the entropy of each component in nats: Gaussian plus Bernoulli."""
+    dim = self.loc.shape[-1]
     gaussian = _half_log_det(self.scale_tril) + 0.5 * dim * (1.0 + _LOG_2PI)
     odds = self.gripper_logits
-    return gaussian + jax.nn.softplus(odds) - odds * jax.nn.sigmoid(odds)
+    return gaussian + jax.nn.softplus(odds) - odds * self.gripper.probs
 
-  def entropy_bound(self) -> Array:
-    """Lower bound of the entropy in nats, from pairwise Bhattacharyya distances.
+  def entropy_bound(self) -> Float[Array, "*b"]:
+    """Returns a lower bound of the entropy in nats.
 
     H >= sum_i w_i H_i - sum_i w_i log sum_j w_j BC_ij (Kolchinsky and Tracey 2017,
     "Estimating Mixture Entropy with Pairwise Distances"), where the Bhattacharyya
     coefficient BC_ij of two components is the product of the Gaussian and the
-    Bernoulli one. Exact for one component, for equal ones and for well separated ones.
-
-    Returns:
-      f32[*b].
+    Bernoulli one. The bound is exact for one component, for equal components and for
+    well separated ones.
     """
-    log_weights = jax.nn.log_softmax(self.logits)
+    log_weights = jnp.asarray(self.choice.logits)
     log_overlap = log_weights[..., None, :] + _log_bhattacharyya(self)
     spread = -jax.nn.logsumexp(log_overlap, axis=-1)
     return jnp.sum(jnp.exp(log_weights) * (self.component_entropy() + spread), axis=-1)
 
 
-def _log_bhattacharyya(gmm: GripperGMM) -> Array:
-  """Log Bhattacharyya coefficients of all pairs of components, f32[*b, K, K]."""
+def _log_bhattacharyya(gmm: GripperGMM) -> Float[Array, "*b k k"]:
+  """Returns the log Bhattacharyya coefficients of all pairs of components."""
   num = gmm.logits.shape[-1]
   rows, columns = jnp.triu_indices(num, k=1)
   scale = gmm.scale_tril
   covariance = scale @ jnp.swapaxes(scale, -1, -2)
   middle = 0.5 * (covariance[..., rows, :, :] + covariance[..., columns, :, :])
-  difference = gmm.mean[..., rows, :] - gmm.mean[..., columns, :]
+  difference = gmm.loc[..., rows, :] - gmm.loc[..., columns, :]
   half_log_det = _half_log_det(scale)
   gaussian = 0.5 * (half_log_det[..., rows] + half_log_det[..., columns])
   gaussian = gaussian + _log_overlap(middle, difference)
@@ -124,16 +141,16 @@ def _log_bhattacharyya(gmm: GripperGMM) -> Array:
   return upper + jnp.swapaxes(upper, -1, -2)
 
 
-def _half_log_det(scale_tril: Array) -> Array:
-  """Half the log determinant of L L^T, for L of f32[..., D, D]."""
+def _half_log_det(scale_tril: Float[Array, "*b d d"]) -> Float[Array, "*b"]:
+  """Returns half the log determinant of L L^T."""
   diagonal = jnp.diagonal(scale_tril, axis1=-2, axis2=-1)
   return jnp.sum(jnp.log(diagonal), axis=-1)
 
 
-def _invert_lower(lower: Array) -> Array:
-  """Inverse of lower-triangular f32[*b, D, D] by forward substitution, row by row."""
+def _invert_lower(lower: Float[Array, "*b d d"]) -> Float[Array, "*b d d"]:
+  """Inverts lower-triangular matrices by forward substitution, row by row."""
   identity = jnp.eye(lower.shape[-1], dtype=lower.dtype)
-  rows: list[Array] = []
+  rows: list[Float[Array, "*b d"]] = []
   for i in range(lower.shape[-1]):
     row = jnp.broadcast_to(identity[i], lower.shape[:-1])
     for j, known in enumerate(rows):
@@ -142,22 +159,23 @@ def _invert_lower(lower: Array) -> Array:
   return jnp.stack(rows, axis=-2)
 
 
+_MatrixVector = tuple[Float[Array, "*b d d"], Float[Array, "*b d"]]
+
+
 @jax.custom_vjp
-def _log_overlap(matrix: Array, difference: Array) -> Array:
-  """-log(det M) / 2 - d^T M^-1 d / 8 for positive definite M: f32[*b].
+def _log_overlap(
+  matrix: Float[Array, "*b d d"], difference: Float[Array, "*b d"]
+) -> Float[Array, "*b"]:
+  """Returns -log(det M) / 2 - x^T M^-1 x / 8 for positive definite M.
 
-  The gradient is written out, as it needs nothing but the inverse.
-
-  Args:
-    matrix: f32[*b, D, D].
-    difference: f32[*b, D].
+  The gradient is written out because it needs only the inverse.
   """
   return _log_overlap_forward(matrix, difference)[0]
 
 
 def _log_overlap_forward(
-  matrix: Array, difference: Array
-) -> tuple[Array, tuple[Array, Array]]:
+  matrix: Float[Array, "*b d d"], difference: Float[Array, "*b d"]
+) -> tuple[Float[Array, "*b"], _MatrixVector]:
   inverse, log_det = _invert(matrix)
   solved = jnp.sum(inverse * difference[..., None, :], axis=-1)
   distance = jnp.sum(difference * solved, axis=-1)
@@ -165,8 +183,8 @@ def _log_overlap_forward(
 
 
 def _log_overlap_backward(
-  saved: tuple[Array, Array], cotangent: Array
-) -> tuple[Array, Array]:
+  saved: _MatrixVector, cotangent: Float[Array, "*b"]
+) -> _MatrixVector:
   inverse, solved = saved
   outer = solved[..., :, None] * solved[..., None, :]
   to_matrix = 0.125 * outer - 0.5 * inverse
@@ -176,11 +194,13 @@ def _log_overlap_backward(
 _log_overlap.defvjp(_log_overlap_forward, _log_overlap_backward)
 
 
-def _invert(matrix: Array) -> tuple[Array, Array]:
-  """Inverse and log determinant of positive definite f32[*b, D, D].
+def _invert(
+  matrix: Float[Array, "*b d d"],
+) -> tuple[Float[Array, "*b d d"], Float[Array, "*b"]]:
+  """Returns the inverse and the log determinant of positive definite matrices.
 
-  Sweeps one row and column after the other (Gauss-Jordan without pivoting, which
-  positive definite matrices do not need); the pivots multiply to the determinant.
+  Sweeps rows and columns in order (Gauss-Jordan without pivoting, which positive
+  definite matrices do not need). The determinant is the product of the pivots.
   """
   log_det = jnp.zeros(matrix.shape[:-2], matrix.dtype)
   for k in range(matrix.shape[-1]):

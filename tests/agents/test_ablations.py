@@ -108,7 +108,7 @@ def test_an_ablation_takes_away_what_it_names_and_nothing_else(flags: str):
 def test_learned_means_are_not_those_of_the_primitives():
   for flags, same in (("", True), ("--agent.prior-mean learned", False)):
     prior, primitives = play(flags).prior()
-    gap = np.abs(prior.mean - np.clip(primitives[..., :6], -1.0, 1.0)).max()
+    gap = np.abs(prior.loc - np.clip(primitives[..., :6], -1.0, 1.0)).max()
     assert (gap < 1e-6) == same
 
 

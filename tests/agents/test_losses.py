@@ -21,7 +21,7 @@ def random_prior(seed: int, batch: int) -> GripperGMM:
   below = np.tril(0.1 * rng.normal(size=(batch, 3, 6, 6)), k=-1)
   return GripperGMM(
     logits=jnp.asarray(rng.normal(size=(batch, 3)), jnp.float32),
-    mean=jnp.asarray(rng.uniform(-1.0, 1.0, (batch, 3, 6)), jnp.float32),
+    loc=jnp.asarray(rng.uniform(-1.0, 1.0, (batch, 3, 6)), jnp.float32),
     scale_tril=jnp.asarray(below + 0.3 * np.eye(6), jnp.float32),
     gripper_logits=jnp.asarray(rng.normal(size=(batch, 3)), jnp.float32),
   )
@@ -119,7 +119,7 @@ def test_alpha_loss_does_not_train_the_values():
 
 def test_m_step_without_entropy_is_the_policy_loss_of_mpo():
   prior = random_prior(0, batch=4)
-  samples = prior.sample(jax.random.key(0), 64)
+  samples = prior.sample(seed=jax.random.key(0), sample_shape=64)
   q, alpha = random_array(10, 64, 4), jnp.full((4,), 0.7)
   weights = boltzmann.importance_weights(q, alpha)
   ours = losses.m_step_loss(prior, samples, weights, jnp.zeros(()))
@@ -137,7 +137,7 @@ def test_m_step_without_entropy_is_the_policy_loss_of_mpo():
 
 def test_m_step_rewards_entropy():
   prior = random_prior(1, batch=2)
-  samples = prior.sample(jax.random.key(0), 8)
+  samples = prior.sample(seed=jax.random.key(0), sample_shape=8)
   weights = jnp.full((8, 2), 1.0 / 8.0)
   without, with_nu = (
     losses.m_step_loss(prior, samples, weights, jnp.float32(nu)) for nu in (0.0, 2.0)
@@ -153,7 +153,7 @@ def test_m_step_trains_neither_samples_nor_weights_nor_nu():
   def total(inputs) -> jax.Array:
     return jnp.sum(losses.m_step_loss(prior, *inputs))
 
-  samples = prior.sample(jax.random.key(0), 8)
+  samples = prior.sample(seed=jax.random.key(0), sample_shape=8)
   inputs = (samples, jnp.full((8, 2), 1.0 / 8.0), jnp.float32(0.5))
   assert all(not np.any(g) for g in jax.tree.leaves(jax.grad(total)(inputs)))
 
@@ -161,8 +161,8 @@ def test_m_step_trains_neither_samples_nor_weights_nor_nu():
 def test_m_step_moves_the_prior_towards_the_policy():
   """Descent lowers KL(q || b), here by weighing the right component (Eq. 3)."""
   prior = random_prior(3, batch=1).replace(logits=jnp.zeros((1, 3)))
-  samples = prior.sample(jax.random.key(1), 2000)
-  distance = jnp.linalg.norm(samples[..., :6] - prior.mean[None, :, 1], axis=-1)
+  samples = prior.sample(seed=jax.random.key(1), sample_shape=2000)
+  distance = jnp.linalg.norm(samples[..., :6] - prior.loc[None, :, 1], axis=-1)
   weights = boltzmann.importance_weights(-distance, jnp.full((1,), 0.1))
 
   def loss(logits: jax.Array) -> jax.Array:

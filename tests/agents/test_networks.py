@@ -229,7 +229,7 @@ def test_outputs_have_the_declared_shapes(pixels: bool, objects: bool):
   shapes = [(4, 20), (4, 3, 7), (4,), (9, 4, 11), (9, 4)]
   assert [output.shape for output in outputs] == shapes
   for num, mixture in mixtures.items():
-    assert mixture.mean.shape == (4, num, 6)
+    assert mixture.loc.shape == (4, num, 6)
     assert mixture.scale_tril.shape == (4, num, 6, 6)
     assert mixture.logits.shape == mixture.gripper_logits.shape == (4, num)
 
@@ -278,7 +278,7 @@ def test_fresh_networks_predict_the_configured_start():
   np.testing.assert_allclose(heads.prior().scale_tril, expected, atol=0.02)
   expected = np.broadcast_to(config.policy_initial_std * np.eye(6), (8, 1, 6, 6))
   np.testing.assert_allclose(heads.policy().scale_tril, expected, atol=0.02)
-  np.testing.assert_allclose(heads.policy().mean, 0.0, atol=0.05)
+  np.testing.assert_allclose(heads.policy().loc, 0.0, atol=0.05)
 
 
 def fresh_heads(config: AgentConfig) -> Heads:
@@ -308,7 +308,7 @@ def test_a_learned_mean_is_trained_and_kept_in_the_box():
   def mean(bias: jax.Array) -> jax.Array:
     head = heads.params["bp"]
     head = {**head, "out": {**head["out"], "bias": bias}}
-    return dataclasses.replace(heads, params={**heads.params, "bp": head}).prior().mean
+    return dataclasses.replace(heads, params={**heads.params, "bp": head}).prior().loc
 
   bias = jnp.zeros(3 * 29)
   assert np.count_nonzero(jax.grad(lambda b: jnp.sum(mean(b)))(bias)) == 18
@@ -377,7 +377,7 @@ def test_prior_is_centered_on_the_primitives_within_the_action_box():
   heads = networks.at(params, seen)
   primitives, prior = np.asarray(heads.primitives()), heads.prior()
   expected = np.clip(primitives[..., :6], -1.0, 1.0)
-  np.testing.assert_array_equal(prior.mean, expected)
+  np.testing.assert_array_equal(prior.loc, expected)
   assert np.abs(expected).max() == 1.0
   surest = np.log((1 - CONFIG.min_prob) / CONFIG.min_prob)
   expected = np.clip(primitives[..., 6], -surest, surest)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from densities import scipy_log_prob
+from densities import distrax_log_prob, scipy_log_prob
+import distrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,6 +47,19 @@ def heads() -> KnownValues:
   return KnownValues(bound.networks, bound.params, bound.phi)
 
 
+@pytest.mark.parametrize("name", ["prior", "policy"])
+def test_prior_and_policy_are_distrax_distributions(heads, name: str):
+  distribution = getattr(heads, name)()
+  assert isinstance(distribution, distrax.Distribution)
+  assert distribution.batch_shape == (STATES,)
+  assert distribution.event_shape == (7,)
+  samples, log_prob = distribution.sample_and_log_prob(
+    seed=jax.random.key(7), sample_shape=20
+  )
+  expected = distrax_log_prob(distribution, samples)
+  np.testing.assert_allclose(log_prob, expected, rtol=1e-4, atol=1e-4)
+
+
 def test_density_of_q_is_the_prior_times_the_importance_weights(heads):
   prior = heads.prior()
   q = non_parametric(heads, prior, jax.random.key(1), num_samples=50)
@@ -64,7 +78,7 @@ def test_parametric_policy_sums_over_the_gripper(heads):
   expected = jax.nn.sigmoid(policy.gripper_logits[:, 0])
   np.testing.assert_allclose(closed, expected, rtol=1e-4)
   mean = jnp.sum(pi.weights[..., None] * pi.samples[..., :6], axis=0)
-  error = (mean - policy.mean[:, 0]) / (policy.scale_tril[:, 0].std() + 0.3)
+  error = (mean - policy.loc[:, 0]) / (policy.scale_tril[:, 0].std() + 0.3)
   assert np.abs(error).max() < 5.0 / np.sqrt(200)
   np.testing.assert_allclose(
     pi.log_prob(pi.samples, pi.q_values), policy.log_prob(pi.samples), rtol=1e-5
@@ -79,7 +93,7 @@ def test_greedy_takes_the_best_draw_or_the_mean_of_the_policy(heads):
     np.testing.assert_array_equal(q.value, q.q_values.max(0))
     pi = parametric(heads, policy, key, num_samples=50, greedy=True)
     action = jnp.sum(pi.weights[..., None] * pi.actions, axis=0)
-    np.testing.assert_array_equal(action[:, :6], np.clip(policy.mean[:, 0], -1.0, 1.0))
+    np.testing.assert_array_equal(action[:, :6], np.clip(policy.loc[:, 0], -1.0, 1.0))
     np.testing.assert_array_equal(action[:, 6], policy.gripper_logits[:, 0] > 0.0)
 
 
@@ -100,7 +114,7 @@ def test_cross_entropy_method_is_that_of_qt_opt(heads):
   """Two draws of 64 and a refit to the 6 best in between, one state at a time."""
   prior, keys = heads.prior(), jax.random.split(jax.random.key(6), 2)
   found = cem(heads, prior, jax.random.key(6), num_samples=0)
-  first = np.asarray(prior.sample(keys[0], 64), np.float64)
+  first = np.asarray(prior.sample(seed=keys[0], sample_shape=64), np.float64)
   mean, std, close = [], [], []
   for draws in np.moveaxis(first, 1, 0):
     arm = np.clip(draws[:, :6], -1.0, 1.0)
@@ -110,18 +124,20 @@ def test_cross_entropy_method_is_that_of_qt_opt(heads):
     std.append(arm[best].std(0).clip(0.01))
     close.append(draws[best, 6].mean().clip(0.001, 0.999))
   base: Any = found.base
-  np.testing.assert_allclose(base.mean[:, 0], mean, atol=1e-5)
+  np.testing.assert_allclose(base.loc[:, 0], mean, atol=1e-5)
   expected = np.asarray(std)[..., None] * np.eye(6)
   np.testing.assert_allclose(base.scale_tril[:, 0], expected, atol=1e-5)
   np.testing.assert_allclose(
     jax.nn.sigmoid(base.gripper_logits[:, 0]), close, atol=1e-5
   )
-  np.testing.assert_array_equal(found.samples, base.sample(keys[1], 64))
+  np.testing.assert_array_equal(
+    found.samples, base.sample(seed=keys[1], sample_shape=64)
+  )
 
 
 def test_uniform_box_is_uniform():
   box = UniformBox((2,), 6)
-  drawn = box.sample(jax.random.key(0), 20_000)
+  drawn = box.sample(seed=jax.random.key(0), sample_shape=20_000)
   draws = np.asarray(drawn)
   assert draws.shape == (20_000, 2, 7)
   np.testing.assert_allclose(draws[..., :6].mean((0, 1)), 0.0, atol=0.02)
@@ -131,6 +147,22 @@ def test_uniform_box_is_uniform():
   # 64 for the arm, two commands: the density integrates to one.
   assert np.exp(box.log_prob(drawn[:1])) * 2.0**7 == pytest.approx(1.0, rel=1e-5)
   np.testing.assert_allclose(box.entropy_bound(), 7.0 * np.log(2.0), rtol=1e-6)
+
+
+def test_uniform_box_is_a_distrax_distribution():
+  box, key = UniformBox((2,), 6), jax.random.key(1)
+  assert isinstance(box, distrax.Distribution)
+  assert box.batch_shape == (2,)
+  assert box.event_shape == (7,)
+  samples, log_prob = box.sample_and_log_prob(seed=key, sample_shape=(3, 4))
+  drawn = box.sample(seed=key, sample_shape=(3, 4))
+  np.testing.assert_array_equal(samples, drawn)
+  # Inside the box the density is that of distrax; outside it does not vanish.
+  sides = distrax.Independent(distrax.Uniform(-jnp.ones((2, 6)), 1.0))
+  expected = sides.log_prob(samples[..., :6]) - np.log(2.0)
+  np.testing.assert_allclose(log_prob, expected, rtol=1e-5)
+  np.testing.assert_array_equal(box.log_prob(3.0 * samples), log_prob)
+  np.testing.assert_allclose(box.entropy(), sides.entropy() + np.log(2.0), rtol=1e-6)
 
 
 def test_reverse_kl_of_a_gaussian_and_a_uniform_prior_is_exact(heads):
@@ -171,6 +203,6 @@ def test_a_projection_brings_the_policy_to_the_better_actions(heads, project):
   psi, _ = jax.jit(lambda p: jax.lax.scan(descend, p, keys))(heads.params["policy"])
   after = dataclasses.replace(heads, params={**heads.params, "policy": psi}).policy()
   before = heads.policy()
-  far = [np.abs(x.mean - heads.goal).mean() for x in (before, after)]
+  far = [np.abs(x.loc - heads.goal).mean() for x in (before, after)]
   assert far[1] < 0.5 * far[0]
   assert np.all(after.gripper_logits > before.gripper_logits)

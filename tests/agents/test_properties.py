@@ -120,7 +120,7 @@ def test_states_do_not_see_each_other_and_candidates_have_no_order(order, pace, 
   below = 0.3 * draw(6, 3, 2, 2)
   prior = GripperGMM(
     logits=draw(6, 3),
-    mean=draw(6, 3, 2),
+    loc=draw(6, 3, 2),
     scale_tril=jnp.tril(below, -1) + jnp.eye(2) * jnp.exp(draw(6, 3, 2, 1)),
     gripper_logits=draw(6, 3),
   )

@@ -159,14 +159,14 @@ def values(heads: Heads, actions: Array) -> np.ndarray:
 
 def of_q(heads: Heads, prior: ActionDistribution, key: Array):
   """Draws of the regularizer, and their weights under q (Eq. 6)."""
-  samples = prior.sample(key, SMALL.policy_samples)
+  samples = prior.sample(seed=key, sample_shape=SMALL.policy_samples)
   return samples, special.softmax(values(heads, samples) / heads.alpha(), axis=0)
 
 
 def of_pi(heads: Heads, key: Array):
   """Half as many draws of the arm, each open and closed, and their weights."""
   policy, half = heads.policy(), SMALL.policy_samples // 2
-  drawn = policy.sample(key, half)
+  drawn = policy.sample(seed=key, sample_shape=half)
   samples = jnp.concatenate([drawn.at[..., 6].set(x) for x in (0.0, 1.0)])
   close = special.expit(policy.gripper_logits[:, 0])
   return samples, np.repeat(np.stack([1.0 - close, close]), half, axis=0) / half
@@ -252,4 +252,4 @@ def test_past_policy_is_that_of_the_target_network():
   heads, slow = example.heads(example.trained), example.heads(example.slow)
   past = regularizer.previous_policy(heads, slow)
   jax.tree.map(np.testing.assert_array_equal, past, slow.policy())
-  assert np.all(np.abs(past.mean - heads.policy().mean).max((1, 2)) > 1e-3)
+  assert np.all(np.abs(past.loc - heads.policy().loc).max((1, 2)) > 1e-3)

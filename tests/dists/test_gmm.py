@@ -1,10 +1,10 @@
-"""The behavior prior against scipy's densities and numerical integration."""
+"""Mixtures against scipy, distrax and numerical integration."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-from densities import scipy_log_prob
+from densities import distrax_log_prob, scipy_log_prob
 import distrax
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ def random_gmm(
   scale = scale + np.eye(dim) * rng.uniform(0.2, 0.8, (*batch, num, dim, 1))
   return GripperGMM(
     logits=jnp.asarray(rng.normal(size=(*batch, num)), jnp.float32),
-    mean=jnp.asarray(spread * rng.normal(size=(*batch, num, dim)), jnp.float32),
+    loc=jnp.asarray(spread * rng.normal(size=(*batch, num, dim)), jnp.float32),
     scale_tril=jnp.asarray(scale, jnp.float32),
     gripper_logits=jnp.asarray(2.0 * rng.normal(size=(*batch, num)), jnp.float32),
   )
@@ -36,7 +36,7 @@ def random_gmm(
 
 def test_log_prob_matches_scipy_for_every_batch_element():
   mixture = random_gmm(0, batch=(2, 3))
-  actions = mixture.sample(jax.random.key(1), 50)
+  actions = mixture.sample(seed=jax.random.key(1), sample_shape=50)
   assert actions.shape == (50, 2, 3, 7)
   ours = jax.jit(GripperGMM.log_prob)(mixture, actions)
   for i in np.ndindex(2, 3):
@@ -50,7 +50,7 @@ def assert_gradient(
 ) -> None:
   """Compares with central differences of a function in double precision."""
   h = 1e-4
-  for name in ("logits", "mean", "scale_tril", "gripper_logits"):
+  for name in ("logits", "loc", "scale_tril", "gripper_logits"):
     value = np.asarray(getattr(mixture, name), np.float64)
     for i in np.ndindex(value.shape):
       if name == "scale_tril" and i[-1] > i[-2]:
@@ -67,27 +67,67 @@ def assert_gradient(
 
 def test_log_prob_gradient_matches_finite_differences_of_scipy():
   mixture = random_gmm(3, dim=2)
-  actions = np.asarray(mixture.sample(jax.random.key(0), 20))
+  actions = np.asarray(mixture.sample(seed=jax.random.key(0), sample_shape=20))
   grads = jax.grad(lambda m: jnp.sum(m.log_prob(jnp.asarray(actions))))(mixture)
   assert_gradient(grads, mixture, lambda m: scipy_log_prob(m, actions).sum())
 
 
 def test_log_prob_matches_distrax_where_the_gripper_is_a_coin():
   mixture = random_gmm(5, batch=(4,)).replace(gripper_logits=jnp.zeros((4, 3)))
-  actions = mixture.sample(jax.random.key(3), 30)
+  actions = mixture.sample(seed=jax.random.key(3), sample_shape=30)
   arm = distrax.MixtureSameFamily(
     distrax.Categorical(logits=mixture.logits),
-    distrax.MultivariateNormalTri(mixture.mean, mixture.scale_tril),
+    distrax.MultivariateNormalTri(mixture.loc, mixture.scale_tril),
   )
   expected = arm.log_prob(actions[..., :6]) - np.log(2.0)
   np.testing.assert_allclose(mixture.log_prob(actions), expected, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("num", [1, 3])
+@pytest.mark.parametrize("sample_shape", [(), (5,), (2, 3)])
+def test_is_a_distrax_distribution_with_the_densities_of_distrax(
+  num: int, sample_shape: tuple[int, ...]
+):
+  mixture = random_gmm(6, batch=(4,), num=num)
+  assert isinstance(mixture, distrax.Distribution)
+  assert mixture.batch_shape == (4,)
+  assert mixture.event_shape == (7,)
+  key = jax.random.key(0)
+  actions, log_prob = mixture.sample_and_log_prob(seed=key, sample_shape=sample_shape)
+  assert actions.shape == (*sample_shape, 4, 7)
+  drawn = mixture.sample(seed=key, sample_shape=sample_shape)
+  np.testing.assert_array_equal(actions, drawn)
+  expected = distrax_log_prob(mixture, actions)
+  np.testing.assert_allclose(log_prob, expected, rtol=1e-4, atol=1e-4)
+  np.testing.assert_allclose(mixture.log_prob(actions), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_log_prob_is_the_same_under_vmap_and_scan():
+  mixture = random_gmm(9, batch=(4,))
+  actions = mixture.sample(seed=jax.random.key(2), sample_shape=5)
+  expected = mixture.log_prob(actions)
+  mapped = jax.vmap(GripperGMM.log_prob, in_axes=(0, 1), out_axes=1)(mixture, actions)
+  _, scanned = jax.lax.scan(lambda m, a: (m, m.log_prob(a)), mixture, actions)
+  np.testing.assert_allclose(mapped, expected, rtol=1e-5, atol=1e-5)
+  np.testing.assert_allclose(scanned, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_entropy_of_one_component_is_that_of_distrax():
+  mixture = random_gmm(12, batch=(4,), num=1)
+  arm = distrax.MultivariateNormalTri(mixture.loc, mixture.scale_tril)
+  gripper = distrax.Bernoulli(logits=mixture.gripper_logits)
+  expected = jnp.squeeze(arm.entropy() + gripper.entropy(), axis=-1)
+  np.testing.assert_allclose(mixture.entropy(), expected, rtol=1e-5, atol=1e-5)
+  np.testing.assert_array_equal(mixture.entropy(), mixture.entropy_bound())
+  with pytest.raises(NotImplementedError, match="entropy_bound"):
+    random_gmm(12).entropy()
+
+
 def test_samples_have_the_moments_of_the_mixture():
   mixture = random_gmm(4)
-  actions = np.asarray(mixture.sample(jax.random.key(2), 200_000))
+  actions = np.asarray(mixture.sample(seed=jax.random.key(2), sample_shape=200_000))
   weights = special.softmax(np.asarray(mixture.logits))
-  means = np.asarray(mixture.mean)
+  means = np.asarray(mixture.loc)
   scale = np.asarray(mixture.scale_tril)
   mean = weights @ means
   second = np.einsum(
@@ -106,11 +146,11 @@ def test_samples_have_the_moments_of_the_mixture():
 def test_gripper_belongs_to_the_component_of_the_arm():
   mixture = GripperGMM(
     logits=jnp.zeros(2),
-    mean=jnp.array([[-10.0] * 6, [10.0] * 6]),
+    loc=jnp.array([[-10.0] * 6, [10.0] * 6]),
     scale_tril=jnp.tile(0.1 * jnp.eye(6), (2, 1, 1)),
     gripper_logits=jnp.array([-2.0, 1.0]),
   )
-  actions = np.asarray(mixture.sample(jax.random.key(0), 50_000))
+  actions = np.asarray(mixture.sample(seed=jax.random.key(0), sample_shape=50_000))
   left = actions[:, 0] < 0.0
   assert actions[left, 6].mean() == pytest.approx(special.expit(-2.0), abs=0.01)
   assert actions[~left, 6].mean() == pytest.approx(special.expit(1.0), abs=0.01)
@@ -147,7 +187,7 @@ def test_entropy_bound_is_exact_at_the_extremes(case: str):
     first = jax.tree.map(lambda x: jnp.repeat(x[:1], 3, axis=0), mixture)
     mixture = first.replace(logits=mixture.logits)
   elif case == "far_arm":
-    mixture = mixture.replace(mean=jnp.array([[-9.0], [0.0], [9.0]]))
+    mixture = mixture.replace(loc=jnp.array([[-9.0], [0.0], [9.0]]))
   else:
     mixture = random_gmm(7, dim=1, num=2)
     mixture = mixture.replace(gripper_logits=jnp.array([-30.0, 30.0]))
@@ -157,7 +197,7 @@ def test_entropy_bound_is_exact_at_the_extremes(case: str):
 
 def test_entropy_bound_in_six_dimensions_against_monte_carlo():
   mixture = random_gmm(11, spread=0.7)
-  actions = np.asarray(mixture.sample(jax.random.key(5), 40_000))
+  actions = np.asarray(mixture.sample(seed=jax.random.key(5), sample_shape=40_000))
   surprise = -scipy_log_prob(mixture, actions)
   error = surprise.std() / np.sqrt(surprise.size)
   bound = float(mixture.entropy_bound())
@@ -176,7 +216,7 @@ def numpy_bound(mixture: GripperGMM) -> float:
     overlaps = []
     for j in range(len(weights)):
       middle = 0.5 * (covariance[i] + covariance[j])
-      d = np.asarray(mixture.mean[i] - mixture.mean[j], np.float64)
+      d = np.asarray(mixture.loc[i] - mixture.loc[j], np.float64)
       dets = [np.linalg.det(c) for c in (covariance[i], covariance[j], middle)]
       arm = (dets[0] * dets[1]) ** 0.25 / np.sqrt(dets[2])
       arm *= np.exp(-0.125 * d @ np.linalg.solve(middle, d))
@@ -206,7 +246,7 @@ def test_entropy_bound_of_a_batch_is_that_of_its_elements():
 
 def test_entropy_and_density_stay_finite_where_the_gripper_is_certain():
   mixture = random_gmm(1).replace(gripper_logits=jnp.array([-60.0, 60.0, 0.0]))
-  actions = mixture.sample(jax.random.key(0), 10)
+  actions = mixture.sample(seed=jax.random.key(0), sample_shape=10)
 
   def total(mixture: GripperGMM) -> jax.Array:
     return mixture.entropy_bound() + jnp.mean(mixture.log_prob(actions))

@@ -1,4 +1,4 @@
-"""Where actions come from and how they are weighed (Table I, column "policy")."""
+"""Policies as weighted candidate actions (Table I, column "policy")."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from apnpql_jax.types import ARM_DOF, Array
 CEM_ITERATIONS = 2
 CEM_SAMPLES = 64
 CEM_ELITES = 6
-"""Of the cross-entropy method, as in QT-Opt (Kalashnikov 2018)."""
+"""Settings of the cross-entropy method, as in QT-Opt (Kalashnikov 2018)."""
 
 CEM_MIN_STD = 0.01
-"""Floor of the deviation of the elites, rad/s, so that the next draw still differs."""
+"""Floor of the elites' standard deviation, rad/s, so that the next draws differ."""
 
 
 def non_parametric(
@@ -29,20 +29,20 @@ def non_parametric(
   num_samples: int,
   greedy: bool = False,
 ) -> Candidates:
-  """q = b exp(Q / alpha) / Z by self-normalized importance sampling (paper Eq. 6).
+  """Samples q = b exp(Q / alpha) / Z by self-normalized importance sampling (Eq. 6).
 
   Args:
     heads: the networks at the states.
     prior: the regularizer b at the same states.
     key: random key.
     num_samples: candidates S per state.
-    greedy: all weight on the one of highest value.
+    greedy: put all weight on the candidate with the highest value.
 
   Returns:
-    Candidates drawn from ``prior`` with weights softmax(Q / alpha); no gradients.
+    Candidates drawn from ``prior`` with weights softmax(Q / alpha), without gradient.
   """
   heads, prior = heads.frozen(), jax.lax.stop_gradient(prior)
-  samples = prior.sample(key, num_samples)
+  samples = prior.sample(seed=key, sample_shape=num_samples)
   actions, outputs, q_values = _evaluate(heads, samples)
   alpha = heads.alpha()
   weights = boltzmann.importance_weights(q_values, alpha)
@@ -59,23 +59,25 @@ def parametric(
   num_samples: int,
   greedy: bool = False,
 ) -> Candidates:
-  """pi_psi: half as many draws of the arm, each with the gripper open and closed.
+  """Samples the arm from pi_psi and pairs each draw with both gripper commands.
 
-  The gripper is summed over exactly: the two share the weight of their draw as pi
-  has it. Gradients reach psi through draws and weights, and nothing else.
+  The two candidates of a draw share its weight in proportion to their density under
+  pi, so the sum over the gripper is exact. Gradients reach only psi, through draws and
+  weights.
 
   Args:
     heads: the networks at the states.
-    prior: not needed.
+    prior: unused.
     key: random key.
     num_samples: candidates S per state, rounded down to an even number.
-    greedy: the mean in place of draws, all weight on the likelier gripper.
+    greedy: use the mean instead of draws and put all weight on the likelier gripper
+      command.
   """
   del prior
   policy = heads.policy()
-  drawn = policy.sample(key, 1 if greedy else num_samples // 2)
+  drawn = policy.sample(seed=key, sample_shape=1 if greedy else num_samples // 2)
   if greedy:
-    drawn = drawn.at[..., :ARM_DOF].set(policy.mean[None, ..., 0, :])
+    drawn = drawn.at[..., :ARM_DOF].set(policy.loc[None, ..., 0, :])
   both = jnp.stack([drawn.at[..., -1].set(gripper) for gripper in (0.0, 1.0)])
   samples = both.reshape(-1, *drawn.shape[1:])
   actions, outputs, q_values = _evaluate(heads.frozen(), samples)
@@ -95,25 +97,25 @@ def cem(
   num_samples: int,
   greedy: bool = False,
 ) -> Candidates:
-  """The best action that the cross-entropy method finds (QT-Opt), from draws of b.
+  """Finds the best action by the cross-entropy method (QT-Opt), starting from b.
 
   Args:
     heads: the networks at the states.
-    prior: the regularizer b: the first draw is its.
+    prior: the regularizer b, the source of the first draw.
     key: random key.
-    num_samples: not needed; ``CEM_SAMPLES`` belong to the method.
-    greedy: not needed; the method is.
+    num_samples: unused; the method draws ``CEM_SAMPLES``.
+    greedy: unused; the method is greedy.
 
   Returns:
-    The last draw, all weight on its best action; no gradients.
+    The last draw with all weight on its best action, without gradient.
   """
   del num_samples, greedy
   heads, base = heads.frozen(), jax.lax.stop_gradient(prior)
   *keys, last = jax.random.split(key, CEM_ITERATIONS)
   for k in keys:
-    samples = base.sample(k, CEM_SAMPLES)
+    samples = base.sample(seed=k, sample_shape=CEM_SAMPLES)
     base = _refit(samples, _evaluate(heads, samples)[2], heads.config.policy_min_prob)
-  samples = base.sample(last, CEM_SAMPLES)
+  samples = base.sample(seed=last, sample_shape=CEM_SAMPLES)
   actions, outputs, q_values = _evaluate(heads, samples)
   weights = _all_on_the_highest(q_values)
   tilt = jnp.zeros(q_values.shape[1:])
@@ -121,19 +123,19 @@ def cem(
 
 
 def _evaluate(heads: Heads, samples: Array) -> tuple[Array, Array, Array]:
-  """Clipped actions, outputs of the value head, Q, each [S, *b, ...]."""
+  """Returns clipped actions, outputs of the value head and Q, each [S, *b, ...]."""
   actions = clip_action(samples)
   outputs = heads.z(actions)
   return actions, outputs, heads.networks.value(outputs)
 
 
 def _all_on_the_highest(x: Array) -> Array:
-  """Weights f32[S, *b] that pick the highest of f32[S, *b]."""
+  """Returns weights f32[S, *b] that select the highest of f32[S, *b]."""
   return jax.nn.one_hot(jnp.argmax(x, axis=0), x.shape[0], axis=0, dtype=x.dtype)
 
 
 def _refit(samples: Array, q_values: Array, min_prob: float) -> GripperGMM:
-  """One diagonal Gaussian, and a probability to close, of the best few of S draws."""
+  """Fits a diagonal Gaussian and a gripper probability to the best few of S draws."""
   elites = jax.lax.top_k(jnp.moveaxis(q_values, 0, -1), CEM_ELITES)[1]
   elites = jnp.moveaxis(elites, -1, 0)[..., None]
   best = clip_action(jnp.take_along_axis(samples, elites, axis=0))
@@ -144,7 +146,7 @@ def _refit(samples: Array, q_values: Array, min_prob: float) -> GripperGMM:
   std = jnp.maximum(std[..., None, :-1], CEM_MIN_STD)
   return GripperGMM(
     logits=jnp.zeros((*close.shape, 1)),
-    mean=mean[..., None, :-1],
+    loc=mean[..., None, :-1],
     scale_tril=scale.at[..., joint, joint].set(std),
     gripper_logits=(jnp.log(close) - jnp.log1p(-close))[..., None],
   )

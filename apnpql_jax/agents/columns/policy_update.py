@@ -1,7 +1,7 @@
-"""From q to the policy (Table I, column "policy update"), with the temperature's dual.
+"""Policy updates with the dual of the temperature (Table I, column "policy update").
 
-q = b exp(Q / alpha) / Z is what improves on b. The policy is either q itself or a
-parametric pi_psi projected onto it, by forward KL as in MPO or by reverse KL as in SAC.
+q = b exp(Q / alpha) / Z improves on b. The policy is either q itself or a parametric
+pi_psi projected onto q, by the forward KL as in MPO or by the reverse KL as in SAC.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from apnpql_jax.types import Array
 
 
 class Improvement(struct.PyTreeNode):
-  """The improved policy at ``*b`` states and the losses that bring it about."""
+  """An improved policy at ``*b`` states and the losses that train it."""
 
-  candidates: Candidates  # of q, or of pi_psi where the KL is the reverse one
-  weights: Array  # f32[S, *b]: of q on the candidates; sum to one over S
-  kl: Array  # f32[*b]: from that policy to the regularizer, nats
-  entropy: Array  # f32[*b]: of q, or of pi_psi where there is one, nats
+  candidates: Candidates  # of q, or of pi_psi for the reverse KL
+  weights: Array  # f32[S, *b]: weights of q on the candidates; sum to one over S
+  kl: Array  # f32[*b]: KL from the policy of the candidates to the regularizer, nats
+  entropy: Array  # f32[*b]: entropy of q, or of pi_psi if there is one, nats
   losses: dict[str, Array]  # f32[*b] each
 
 
 def none(heads: Heads, prior: ActionDistribution, key: Array) -> Improvement:
-  """q as it is; only alpha is trained, by the dual of its limit (paper Eq. 7)."""
+  """Keeps q as the policy; trains only alpha, by the dual of its KL limit (Eq. 7)."""
   config = heads.config
   q = non_parametric(heads, prior, key, num_samples=config.policy_samples)
   dual = losses.alpha_loss(q.q_values, heads.alpha(), epsilon=config.epsilon)
@@ -39,7 +39,7 @@ def none(heads: Heads, prior: ActionDistribution, key: Array) -> Improvement:
 
 
 def forward_kl(heads: Heads, prior: ActionDistribution, key: Array) -> Improvement:
-  """min KL(q || pi_psi), moment matching (MPO): weighted likelihood of the candidates.
+  """Minimizes KL(q || pi_psi) by weighted maximum likelihood (MPO, moment matching).
 
   The candidates are those of q, drawn from the regularizer.
   """
@@ -52,11 +52,11 @@ def forward_kl(heads: Heads, prior: ActionDistribution, key: Array) -> Improveme
 
 
 def reverse_kl(heads: Heads, prior: ActionDistribution, key: Array) -> Improvement:
-  """min KL(pi_psi || q), mode seeking (SAC): alpha KL(pi || b) - E_pi[Q].
+  """Minimizes KL(pi_psi || q) through alpha KL(pi || b) - E_pi[Q] (SAC, mode seeking).
 
-  The arm is reparameterised, the gripper summed over. The dual of the limit
-  KL(pi || b) <= epsilon is alpha (epsilon - KL). Where b is uniform the limit is a
-  floor on the entropy: H(pi) >= log volume - epsilon.
+  The arm is reparameterized and the gripper summed over. The dual of the limit
+  KL(pi || b) <= epsilon is alpha (epsilon - KL). With a uniform b the limit is a floor
+  on the entropy: H(pi) >= log volume - epsilon.
   """
   config = heads.config
   pi = parametric(heads, prior, key, num_samples=config.policy_samples)
@@ -69,7 +69,7 @@ def reverse_kl(heads: Heads, prior: ActionDistribution, key: Array) -> Improveme
     "loss/policy": jax.lax.stop_gradient(alpha) * kl - pi.value,
     "loss/alpha": losses.kl_dual(kl, alpha, epsilon=config.epsilon),
   }
-  # b exp(Q / alpha) / pi, times the weights that pi itself has on its draws.
+  # b exp(Q / alpha) / pi, times the weights of pi on its own draws.
   tilted = pi.q_values + alpha[None] * (jnp.log(pi.weights) - log_ratio)
   weights = jax.lax.stop_gradient(boltzmann.importance_weights(tilted, alpha))
   return Improvement(pi, weights, kl, pi.base.entropy_bound(), terms)
