@@ -152,8 +152,15 @@ def random_batch(
   windows: int = 0,
   instants: int = 0,
 ) -> Transition:
-  """Transitions with noise for everything; if asked with images, with a window of N
-  instants, and with observations of L instants each."""
+  """Returns transitions of noise.
+
+  Args:
+    seed: of NumPy's generator.
+    batch: transitions B.
+    pixels: with images.
+    windows: N instants in ``Transition.window``; 0 for none.
+    instants: L instants per observation; 0 for single observations.
+  """
   rng = np.random.default_rng(seed)
 
   def normal(*shape: int) -> jax.Array:

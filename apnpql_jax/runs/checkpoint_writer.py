@@ -148,8 +148,7 @@ class CheckpointWriter:
 
 
 class _KeepNewestAndBest:
-  """Orbax policy that keeps the newest checkpoints, the holders of their items, and the
-  best one.
+  """Orbax policy that keeps the newest checkpoints, their items, and the best one.
 
   Orbax's own policies do not see items, and its BestN reads the rate from an item that
   existing checkpoints lack.

@@ -84,8 +84,10 @@ def our_view(model: Any, states: np.ndarray, name: str, size: tuple[int, int]) -
 
 
 def label(model: mujoco.MjModel) -> np.ndarray:
-  """Labels geoms, i[ngeom + 1], by body and color: the boxes of a cup share their tops,
-  where any of them may be drawn. The last label is -1, for nothing."""
+  """Labels geoms, i[ngeom + 1], by body and color; the last label is -1, for nothing.
+
+  The boxes of a cup share their tops, where any of them may be drawn.
+  """
   things = np.column_stack([model.geom_bodyid, model.geom_rgba])
   return np.append(np.unique(things, axis=0, return_inverse=True)[1], -1)
 

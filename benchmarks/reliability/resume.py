@@ -53,8 +53,7 @@ def train(run: Path, *args: str) -> None:
 
 
 def compare(a: Arrays, b: Arrays) -> dict[str, Any]:
-  """Counts the arrays that are the same bits, and returns how much others differ: the
-  largest difference divided by the array's largest number.
+  """Counts the arrays of equal bits and measures the largest relative difference.
 
   Raises:
     ValueError: the states have different arrays.

@@ -184,8 +184,7 @@ def same_bits(trials: list[Trial], total: int, patience_s: float) -> bool:
 
 
 def same_metrics(*runs: Path) -> bool:
-  """Returns whether every run has each iteration once, and all have the same losses up
-  to the end of the shortest."""
+  """Returns whether all runs have each iteration once and the same losses."""
   losses = []
   for run in runs:
     rows = [row for row in testing.rows(run) if "loss/q" in row]
@@ -251,8 +250,7 @@ def soak(folder: Path, minutes: float, rng: random.Random) -> tuple[Row, list[Ro
 
 
 def poison(run: Path, *, rewards: bool) -> None:
-  """Puts NaN into all rewards of both replays, or into the velocity of one world, and
-  saves that as the only checkpoint of a run."""
+  """Saves a run's only checkpoint with NaN in all rewards or in one world's velocity."""
   config = run_folder.load_run_config(run)
   env, agent = make_env(config.env), make_agent(config.agent)
   example = example_state(config, env, agent)

@@ -59,8 +59,7 @@ def measure_all(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def short(task: str) -> list[str]:
-  """Returns options that shorten a preset without changing its programs; builds the
-  bank of reset states, so that it is not part of a start."""
+  """Builds the reset bank; returns options that shorten a preset, not its programs."""
   config = load_preset(task)
   load_bank(make_task(config.env.task), config.env.bank_rows)
   slots = str(PERIODS * config.env.worlds)

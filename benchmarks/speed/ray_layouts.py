@@ -104,8 +104,7 @@ def cast_by_type(
   near: Any,
   rays: Any,
 ) -> Cast:
-  """Casts as ``raycast._cast`` without checkers and shadows, all geoms of a type at
-  once, and picks the nearest of all hits afterwards."""
+  """Casts all geoms of a type at once, then picks the nearest hit; no shadows."""
   ray_light = intersect.along(basis[2], rays)
 
   def hits(kind: int) -> Cast:

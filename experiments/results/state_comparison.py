@@ -235,8 +235,7 @@ def _steps_to_goal(run: Result) -> str:
 
 
 def _pool(jobs: int) -> ThreadPoolExecutor:
-  """Threads whose runs keep to cores of their own, for threads of two runs on the same
-  cores wait for each other."""
+  """Returns threads that pin their runs to separate cores, so that none waits."""
   cores = sorted(os.sched_getaffinity(0))
   shares = iter([cores[i::jobs] or cores for i in range(jobs)])
   return ThreadPoolExecutor(

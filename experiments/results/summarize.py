@@ -54,7 +54,7 @@ def plot(folders: list[RunFolder], path: Path) -> None:
     minutes = [row["time/wall_s"] / 60 for row in rows]
     rates = [100 * row["eval/success_rate"] for row in rows]
     axes.plot(minutes, rates, "o-", label=f"seed {folder.config.seed}")
-  axes.axhline(100 * GOAL, color="grey", linestyle=":")
+  axes.axhline(100 * GOAL, color="gray", linestyle=":")
   axes.set(xlabel="wall clock (min)", ylabel="held-out success (%)", ylim=(-2, 102))
   axes.set_title(folders[0].config.env.task)
   axes.legend()

@@ -40,8 +40,8 @@ ADDED = {
   "agent.color_jitter": 0.0,
   "replay.demonstrations": "",
 }
-"""Behavior of runs from before these settings existed. No value may ever change here: if
-a default does, pass the old one to ``codec.added``."""
+"""Behavior of runs from before these settings existed. No value here may ever
+change. If a default does, pass the old one to ``codec.added``."""
 
 
 def changed(path: str, value: object) -> TrainConfig:
@@ -56,7 +56,7 @@ def replaced(config, names, value):
 
 
 def edited(path: str, value: object) -> str:
-  """Returns the default configuration as JSON with one key set, or removed by ``...``."""
+  """Returns the default configuration as JSON with one key set; ``...`` removes it."""
   data = json.loads(config_to_json(TrainConfig()))
   *parents, last = path.split(".")
   node = data

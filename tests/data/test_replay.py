@@ -247,8 +247,7 @@ def test_neither_transition_nor_window_reaches_an_excluded_episode():
 
 
 def test_episodes_are_counted_at_their_ends():
-  """The first world solves two and runs out of time in one; the second one's episode
-  is excluded, every slot of it."""
+  """World 0 solves two episodes and times out in one; that of world 1 is excluded."""
   stream = _stream(12, WORLDS, end_rate=0.0, seed=0)
   stream.timestep.terminated[[2, 9], 0] = True
   stream.timestep.truncated[6, 0] = True
