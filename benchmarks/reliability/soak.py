@@ -250,7 +250,7 @@ def soak(folder: Path, minutes: float, rng: random.Random) -> tuple[Row, list[Ro
 
 
 def poison(run: Path, *, rewards: bool) -> None:
-  """Saves a run's only checkpoint with NaN in all rewards or in one world's velocity."""
+  """Saves a run's only checkpoint with NaN in all rewards, or in a world's velocity."""
   config = run_folder.load_run_config(run)
   env, agent = make_env(config.env), make_agent(config.agent)
   example = example_state(config, env, agent)
