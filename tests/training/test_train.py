@@ -59,7 +59,7 @@ def test_a_run_writes_all_its_files(finished):
   assert checkpoint_reader.all_steps(run_dir) == [32, 64]
   assert iio.imread(folder.curve).shape[-1] in (3, 4)
   (video,) = folder.videos.iterdir()
-  frames = iio.imread(video)
+  frames = iio.imread(video, plugin="pyav")
   # Both cameras are next to the larger view, and something moves.
   assert frames.shape[0] > 10 and frames.shape[2] > 1.5 * frames.shape[1]
   assert np.abs(frames[0].astype(int) - frames[8]).max() > 50
@@ -72,7 +72,7 @@ def test_evaluate_reports_the_newest_checkpoint(finished, tmp_path):
   assert figures["checkpoint_step"] == 64
   assert figures["episodes"] == 4 and figures["greedy"]
   # All time steps of all four, the last of each held.
-  frames = len(iio.imread(next(video.parent.iterdir())))
+  frames = len(iio.imread(next(video.parent.iterdir()), plugin="pyav"))
   assert frames == 4 * (figures["mean_length"] + HOLD)
   assert figures["backend"] == "native" and figures["algorithm"] == "ap_npql"
   low, high = figures["ci95"]
