@@ -29,7 +29,7 @@ def train(*_):
     busy()
 
 command = busy if sys.argv[1] == "listing" else train
-main._COMMANDS["list"] = (options.List, command, None)
+main._COMMANDS["list"] = (options.List, command)
 main.main(["list"])
 """
 
@@ -87,7 +87,7 @@ from apnpql_jax.cli import main, options
 def stop(*_):
   raise errors.RunStopped("no space left", errors.FAILED)
 
-main._COMMANDS["list"] = (options.List, stop, None)
+main._COMMANDS["list"] = (options.List, stop)
 main.main(["list"])
 """
 
