@@ -45,6 +45,8 @@ def parse(
   if args.quick:
     flags = os.environ.get("XLA_FLAGS", "")
     os.environ["XLA_FLAGS"] = f"{flags} {testing.XLA_FLAGS}".lstrip()
+  # Processes that a benchmark starts share the device with it.
+  os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
   runtime.configure()
   if "precision" in args:
     args.repeats = 2 if args.quick else args.repeats

@@ -81,31 +81,26 @@ class Suite:
     """
     self.report: dict[str, Any] = {"commit": store.commit(), "sections": {}}
     self._out, self._deadline, self._lock = out, deadline, threading.Lock()
-    self._env = os.environ | {
-      "PYTHONPATH": str(store.ROOT),
-      # Sections share the device.
-      "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
-      turns.FOLDER: folder,
-    }
+    self._env = os.environ | {"PYTHONPATH": str(store.ROOT), turns.FOLDER: folder}
 
   def run(self, name: str, args: Sequence[str]) -> str:
     """Runs a benchmark until its end or the deadline; returns a line about its end."""
     began = time.monotonic()
-    section: dict[str, Any] = {"args": list(args), "report": {"results": []}}
-    results = section["report"]["results"]
+    command, results = ["-m", f"benchmarks.{args[0]}", *args[1:]], []
+    report = {"command": " ".join(command[1:]), "results": results}
+    section: dict[str, Any] = {"report": report}
     self._put(name, section)
-    command = [sys.executable, "-m", f"benchmarks.{args[0]}", *args[1:]]
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "text": True}
     pipes |= {"env": self._env, "start_new_session": True}
     with tempfile.TemporaryFile("w+") as errors:
-      process = subprocess.Popen(command, stderr=errors, **pipes)
+      process = subprocess.Popen([sys.executable, *command], stderr=errors, **pipes)
       late = threading.Timer(self._deadline - began, _kill, [process])
       late.start()
       for line in process.stdout or ():
         with contextlib.suppress(ValueError, TypeError):  # Libraries print, too.
           found = dict(json.loads(line))
           if "benchmark" in found:
-            section["report"] |= found
+            report |= found
           else:
             results.append(found)
           self._put(name, section)
@@ -113,9 +108,12 @@ class Suite:
       late.cancel()
       errors.seek(0)
       lines = errors.read().strip().splitlines()
-    failed = f"failed: {lines[-1] if lines else code}"
-    section["status"] = {0: "done", -signal.SIGKILL: "out of time"}.get(code, failed)
-    section["seconds"] = time.monotonic() - began
+    ended = time.monotonic()
+    section["status"] = "done"
+    if code:
+      reason = f"failed: {lines[-1] if lines else code}"
+      section["status"] = "out of time" if ended >= self._deadline else reason
+    section["seconds"] = ended - began
     self._put(name, section)
     return f"{name}: {section['status']}, {len(results)} results {results[-1:]}"
 

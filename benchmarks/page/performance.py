@@ -80,7 +80,7 @@ def write(results: Path = store.RESULTS, doc: Path = DOC) -> None:
     tables.put("answer", answer(found), doc)
   if "gpu" in files:
     sections = json.loads(files["gpu"].read_text())["sections"].values()
-    blocks = [reports.block(s["report"]) for s in sections if s["report"]["results"]]
+    blocks = [reports.block(x["report"]) for x in sections if x["report"]["results"]]
     tables.put("gpu", "\n\n".join(blocks), doc)
   images = doc.parent / "images"
   images.mkdir(exist_ok=True)

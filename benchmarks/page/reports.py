@@ -63,8 +63,9 @@ def block(report: Report) -> str:
 def caption(report: Report) -> str:
   """Returns command, commit, machine and settings of a report."""
   versions = report["versions"]
+  command = report.get("command") or f"{module(report['benchmark'])} --store"
   parts = [
-    f"`python -m {module(report['benchmark'])} --store`",
+    f"`python -m {command}`",
     f"commit {report['commit'] or 'unknown'}",
     f"{report['device']}, {report['cores']} cores",
     *(f"{name} {versions[name]}" for name in ("jax", "mujoco") if name in versions),
