@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Sequence
 import dataclasses
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -153,7 +154,7 @@ class Lighting:
       raise ValueError("a geom cannot both cast and receive shadows")
 
   @classmethod
-  def from_model(cls, model: mujoco.MjModel, **settings) -> Lighting:
+  def from_model(cls, model: mujoco.MjModel, **settings: Any) -> Lighting:
     """Takes the direction of the model's only directional light.
 
     Args:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from apnpql_jax import testing
 from apnpql_jax.config.ranges import RandomizationConfig
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.envs.env import Env, make_env
@@ -85,7 +83,7 @@ def drawn(task) -> physics.PhysicsState:
 
 
 def _kinematics(task):
-  return jax.jit(make_kinematics(task.scene), compiler_options=testing.FAST_COMPILE)
+  return jax.jit(make_kinematics(task.scene))
 
 
 def _bits(tree) -> list[bytes]:
@@ -263,7 +261,7 @@ def test_both_engines_move_the_same_worlds(task, drawn):
   drawn = drawn.replace(qpos=drawn.qpos.at[:, fingers].set(0.6))
   for name in ("native", "mjx"):
     engine = engines.make_physics(name, task.scene, substeps=10)
-    step = jax.jit(engine.step, compiler_options=testing.FAST_COMPILE)
+    step = jax.jit(engine.step)
     moved[name] = step(step(drawn, velocity, close), -velocity, close)
   np.testing.assert_allclose(moved["native"].qpos, moved["mjx"].qpos, atol=2e-4)
   plain = drawn.replace(fields={}, command=None)
@@ -282,8 +280,7 @@ def _episodes(env: Env):
   play = jax.jit(
     lambda rows, key: rollout(
       env, expert_policy(env, noise=0.1), env.reset(rows), key, length=9
-    ),
-    compiler_options=testing.FAST_COMPILE,
+    )
   )
   return play(jnp.arange(4), jax.random.key(0))
 
@@ -319,7 +316,7 @@ def test_each_episode_has_its_own_world(plain_env):
     dataclasses.replace(CONFIG, randomize=True), plain_env.task, plain_env._bank
   )
 
-  @functools.partial(jax.jit, compiler_options=testing.FAST_COMPILE)
+  @jax.jit
   def play(rows, key):
     def period(state, key):
       action = env.expert_action(state)

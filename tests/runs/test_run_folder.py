@@ -73,6 +73,12 @@ def test_changed_versions_are_listed(tmp_path: Path):
   assert changed_versions(folder.versions) == ["versions.json cannot be read"]
 
 
+def test_another_number_of_devices_is_a_changed_version(tmp_path: Path):
+  folder = run_folder.create(tmp_path / "run", CONFIG, devices=2)
+  assert changed_versions(folder.versions, devices=2) == []
+  assert changed_versions(folder.versions, devices=4) == ["count 2 -> 4"]
+
+
 def test_a_run_is_replaced_only_when_asked(tmp_path: Path):
   run = tmp_path / "run"
   run_folder.create(run, CONFIG)

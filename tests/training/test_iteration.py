@@ -70,7 +70,7 @@ def built(request) -> Built:
   state = initial_state(config, env, agent, collect_expert)
   assert all(x.committed for x in jax.tree.leaves(state))
   jitted: Any = make_iteration(config, env, agent)
-  iteration = jitted.lower(state).compile(compiler_options=testing.FAST_COMPILE)
+  iteration = jitted.lower(state).compile()
   for _ in range(3):
     state, metrics = iteration(state)
   assert metrics["faults/worlds"] == metrics["faults/updates"] == 0
