@@ -15,9 +15,9 @@ import numpy as np
 from apnpql_jax import devices
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config.schema import EnvConfig
-from apnpql_jax.console import say
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.runs import checkpoint_reader, leaves, run_folder
+from apnpql_jax.runs.console import say
 from apnpql_jax.runs.metrics import wilson_interval
 from apnpql_jax.training.rollout import (
   Episodes,

@@ -19,12 +19,12 @@ from apnpql_jax import devices, errors
 from apnpql_jax.agents.learner import Agent, make_agent
 from apnpql_jax.config import codec
 from apnpql_jax.config.schema import TrainConfig
-from apnpql_jax.console import say
 from apnpql_jax.data import demonstrations, replay
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.errors import RunStopped
 from apnpql_jax.runs import checkpoint_reader, leaves, run_folder, versions
 from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
+from apnpql_jax.runs.console import say
 from apnpql_jax.runs.metrics import MetricWriter
 from apnpql_jax.runs.progress import TrainProgress
 from apnpql_jax.runs.run_folder import RunFolder
