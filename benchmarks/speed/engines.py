@@ -27,7 +27,6 @@ from benchmarks.common.mjx_patching import patched
 
 TASK = "push_plate"
 
-
 VARIANTS: dict[str, dict[str, Any]] = {
   "barrier and cones": {"barrier": True, "cones": True},
   "barrier": {"barrier": True, "cones": False},

@@ -142,6 +142,26 @@ def test_draws_fill_their_range_and_differ_between_worlds(task, drawn):
   assert light.max() <= 1.0 + 1e-6
 
 
+@pytest.mark.parametrize(("camera", "share"), [("global", 1.0), ("wrist", 0.1)])
+def test_each_camera_shifts_within_its_own_range(task, drawn, camera, share):
+  index = task.scene.id("camera", camera)
+  shift = drawn.fields["cam_pos"][:, index] - task.scene.model.cam_pos[index]
+  limit = share * ALL.camera_shift
+  assert 0.5 * limit < np.abs(shift).max() <= 1.001 * limit
+
+
+def test_inertia_is_proportional_to_mass(task):
+  """Without changes of size or shape; the robot keeps its mass."""
+  model = task.scene.model
+  fields = _randomized(task, dataclasses.replace(NONE, mass=ALL.mass)).fields
+  heavy = model.body_mass > 0
+  mass = np.asarray(fields["body_mass"])[:, heavy] / model.body_mass[heavy]
+  inertia = np.asarray(fields["body_inertia"])[:, heavy] / model.body_inertia[heavy]
+  np.testing.assert_allclose(inertia, np.repeat(mass[..., None], 3, -1), rtol=1e-5)
+  changed = [model.body(i).name for i in np.flatnonzero(heavy)[np.ptp(mass, 0) > 0.1]]
+  assert changed == ["plate"]
+
+
 def test_geoms_of_the_robot_change_their_color_together(task, drawn):
   model = task.scene.model
   change = np.asarray(drawn.fields["geom_rgba"])[0] - model.geom_rgba
