@@ -20,7 +20,9 @@ from apnpql_jax.tasks.task import ResetDraw
 
 # Figures are written to files; no test may need a display.
 os.environ.setdefault("MPLBACKEND", "Agg")
-# Compilation takes most of the time of the tests, so it does not optimize.
+# Compilation takes most of the time of the tests, so it does not optimize. Results
+# then differ in their last bits, so the tests keep their reset banks to themselves.
+os.environ["XDG_CACHE_HOME"] = str(testing.ROOT / ".pytest_cache" / "home")
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {testing.XLA_FLAGS}"
 runtime.configure()
 
