@@ -54,7 +54,7 @@ def _read(path: Path, model: mujoco.MjModel) -> dict[str, np.ndarray]:
   if missing:
     raise FileError(
       f"{path} lacks the poses of {', '.join(missing)}, from which rewards, labels and "
-      "images are computed; record them beside the joint angles"
+      "images are computed; record them with the joint angles"
     )
   shapes = {"time": (), "joints": (6,), "gripper": (), **dict.fromkeys(bodies, (7,))}
   if unknown := sorted(arrays.keys() - shapes.keys() - {"episode", "variant"}):

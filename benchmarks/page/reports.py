@@ -141,7 +141,7 @@ Prepared = tuple[list[Result], list[str]]  # rows of the first table, and furthe
 
 
 def render(report: Report) -> Prepared:
-  """Separates the ray caster from other renderers, which are told as ratios."""
+  """Separates the ray caster from other renderers, which are reported as ratios."""
   ours, others, best = [], [], {}
   for result in report["results"]:
     name, rate = result["resolution"], result.get("pairs_per_s", math.nan)

@@ -287,7 +287,7 @@ def test_what_a_recording_cannot_tell_is_asked_for(tmp_path, demos, env):
     with pytest.raises(UserError, match=match):
       real_arm.convert(path, env.task.scene, period_s=0.15)
 
-  refused("lacks the poses of goal, plate: rewards, labels", plate=None, goal=None)
+  refused("lacks the poses of goal, plate, from which rewards", plate=None, goal=None)
   refused("time must increase", time=-whole["time"])
   refused("joints must be numbers of shape", joints=whole["joints"][:, :5])
   refused("moves at .* rad/s", joints=5 * whole["joints"])
