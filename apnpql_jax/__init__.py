@@ -4,41 +4,25 @@ The names below are the public API, imported on first use so that importing the 
 is fast. Programs call ``configure`` first.
 """
 
+# ruff: noqa: F401 (the imports are the API)
 from __future__ import annotations
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from apnpql_jax.version import __version__ as __version__
+from apnpql_jax.version import __version__
 
 if TYPE_CHECKING:
-  from apnpql_jax.agents.learner import Agent as Agent, make_agent as make_agent
-  from apnpql_jax.config.files import (
-    load_preset as load_preset,
-    preset_names as preset_names,
-  )
-  from apnpql_jax.config.ranges import RandomizationConfig as RandomizationConfig
-  from apnpql_jax.config.schema import (
-    AgentConfig as AgentConfig,
-    EnvConfig as EnvConfig,
-    ReplayConfig as ReplayConfig,
-    TrainConfig as TrainConfig,
-  )
-  from apnpql_jax.envs.env import Env as Env, make_env as make_env
-  from apnpql_jax.errors import (
-    ConfigError as ConfigError,
-    RunStopped as RunStopped,
-    UserError as UserError,
-  )
-  from apnpql_jax.runtime import configure as configure
-  from apnpql_jax.tasks.task import (
-    Task as Task,
-    make_task as make_task,
-    register_task as register_task,
-    task_names as task_names,
-  )
-  from apnpql_jax.training.evaluate import evaluate as evaluate
-  from apnpql_jax.training.train import train as train
+  from apnpql_jax.agents.learner import Agent, make_agent
+  from apnpql_jax.config.files import load_preset, preset_names
+  from apnpql_jax.config.ranges import RandomizationConfig
+  from apnpql_jax.config.schema import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
+  from apnpql_jax.envs.env import Env, make_env
+  from apnpql_jax.errors import ConfigError, RunStopped, UserError
+  from apnpql_jax.runtime import configure
+  from apnpql_jax.tasks.task import Task, make_task, register_task, task_names
+  from apnpql_jax.training.evaluate import evaluate
+  from apnpql_jax.training.train import train
 
 _MODULES = {
   "agents.learner": ("Agent", "make_agent"),

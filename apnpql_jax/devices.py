@@ -9,6 +9,7 @@ each computes for its own devices, and the first one writes and prints.
 from __future__ import annotations
 
 from collections.abc import Callable
+import contextlib
 import itertools
 import os
 from pathlib import Path
@@ -21,9 +22,7 @@ import numpy as np
 
 from apnpql_jax.errors import ConfigError, one_line
 
-AXIS = "worlds"
-"""The only axis of the mesh; batches are split along it too."""
-
+AXIS = "worlds"  # the only axis of the mesh; batches are split along it too
 _MEMINFO = Path("/proc/meminfo")
 _CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 _BARRIER_TIMEOUT_MS = 3_600_000
@@ -31,13 +30,10 @@ _barriers = itertools.count()
 
 
 def join(coordinator: str, processes: int | None, process: int | None) -> None:
-  """Joins the processes of a run; must precede the start of JAX's backend.
+  """Joins the processes of a run, or raises ``ConfigError``; call it before JAX starts.
 
   ``coordinator`` is the address and port of the first process, or "auto" to get all
   three values from the batch system.
-
-  Raises:
-    ConfigError: The processes cannot connect.
   """
   # The run handles signals itself; JAX would take over SIGTERM.
   jax.config.update("jax_enable_preemption_service", False)
@@ -49,12 +45,9 @@ def join(coordinator: str, processes: int | None, process: int | None) -> None:
 
 
 def make_mesh(devices: int) -> Mesh | None:
-  """Returns a one-dimensional mesh of the first devices, or None for a single one.
+  """Returns a mesh of the first devices, 0 for all; None for a single device.
 
-  0 means all devices of all processes.
-
-  Raises:
-    ConfigError: There are fewer devices.
+  Raises ``ConfigError`` if there are fewer devices in all processes.
   """
   found = jax.devices()
   if not 0 <= devices <= len(found):
@@ -66,9 +59,8 @@ def make_mesh(devices: int) -> Mesh | None:
 def per_device(function: Callable[..., Any], mesh: Mesh | None) -> Callable[..., Any]:
   """Returns a function of arrays [worlds, ...] that each device runs on its own worlds.
 
-  For computations without interaction between worlds. XLA can partition these too, but
-  not host calls, and a loop would run on all devices until the last world is done, with
-  a message between devices in every iteration.
+  Worlds must not interact. XLA could not partition host calls, and would run a loop on
+  all devices until the last world is done, with a message in every iteration.
   """
   if mesh is None:
     return function
@@ -116,11 +108,7 @@ def barrier() -> None:
 
 
 def check_memory(needed: int, what: str, available: int | None = None) -> None:
-  """Checks that ``needed`` bytes are available, by default on each device.
-
-  Raises:
-    ConfigError: They are not; the message starts with ``what``.
-  """
+  """Raises ``ConfigError`` if memory, by default each device's, is below ``needed``."""
   free = available_memory() if available is None else available
   if free is not None and needed > free:
     raise ConfigError(
@@ -145,19 +133,16 @@ def host_memory() -> int | None:
 
 
 def _free_memory() -> int | None:
-  try:
+  with contextlib.suppress(OSError, KeyError, ValueError):
     lines = dict(x.split(":", 1) for x in _MEMINFO.read_text().splitlines())
     return int(lines["MemAvailable"].split()[0]) * 1024
-  except (OSError, KeyError, ValueError):
-    pass
-  try:  # Outside Linux: total memory, free or not.
+  with contextlib.suppress(AttributeError, OSError, ValueError):
+    # Outside Linux: total memory, free or not.
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-  except (AttributeError, OSError, ValueError):
-    return None
+  return None
 
 
 def _container_limit() -> int | None:
-  try:
+  with contextlib.suppress(OSError, ValueError):  # No limit, or "max".
     return int(_CGROUP_LIMIT.read_text())
-  except (OSError, ValueError):  # No limit, or "max".
-    return None
+  return None

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-INTERRUPTED = 128
-"""Exit code of a run stopped by a signal, to which the signal number is added."""
-
-FAILED = 3
-"""Exit code of a run that stopped on an error: disk full or values not finite."""
+INTERRUPTED = 128  # plus the signal number: exit code of a run stopped by a signal
+FAILED = 3  # exit code of a run stopped by an error: disk full or values not finite
 
 
 class UserError(Exception):
@@ -38,10 +35,6 @@ def one_line(error: BaseException) -> str:
 
 
 def check_name(field: str, value: str, valid: Sequence[str]) -> None:
-  """Checks that ``value`` is one of the valid choices.
-
-  Raises:
-    ConfigError: It is not; the message lists the choices.
-  """
+  """Raises ``ConfigError``, which lists the choices, unless ``value`` is valid."""
   if value not in valid:
     raise ConfigError(f"unknown {field} {value!r}; choose from {', '.join(valid)}")

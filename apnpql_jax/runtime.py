@@ -1,8 +1,7 @@
 """Process-wide settings that must precede the start of JAX's backend.
 
-They go through the environment, and through ``jax.config`` if JAX is already imported;
-this module does not import it. Values set by the user are kept, except for a thread
-count that can deadlock.
+They go through the environment, and through ``jax.config`` if JAX is already imported.
+Values set by the user are kept, except for a thread count that can deadlock.
 """
 
 from __future__ import annotations
@@ -16,22 +15,15 @@ from pathlib import Path
 import re
 import sys
 
-MIN_THREADS = 4
-"""Smallest XLA:CPU thread pool per device in which two batched Cholesky calls cannot
-deadlock. Emulated devices of one CPU share a pool."""
-
+MIN_THREADS = 4  # XLA:CPU threads per emulated device, which share a pool
+# Operations that XLA:CPU runs in the library YNNPACK; its default adds "REDUCE".
 KEPT_FUSIONS = "INDIVIDUAL_CONVOLUTION", "INDIVIDUAL_DOT"
-"""Operations that XLA:CPU runs in the library YNNPACK; its default adds "REDUCE"."""
-
+# The flag and the jaxlib versions that have it; XLA aborts on unknown flags.
 _FLAG, _FLAG_VERSIONS = "xla_cpu_experimental_ynn_fusion_type", r"0\.1[01]\."
-"""The flag and the jaxlib versions that have it; XLA aborts on unknown flags."""
 
 
 def configure() -> None:
-  """Sets threads, XLA flags, compilation cache and precision; idempotent.
-
-  Call this before JAX runs anything; the command line does.
-  """
+  """Sets threads, XLA flags, cache and precision; must run before JAX runs anything."""
   _set_threads()
   _set_fusions()
   defaults = {
@@ -56,10 +48,7 @@ def cache_dir() -> Path:
 
 @contextlib.contextmanager
 def quiet_warp() -> Generator[None, None, None]:
-  """Drops the lines that MJX prints when imported without the optional Warp.
-
-  They go to standard output and look like errors. Other output passes through.
-  """
+  """Drops the error-like lines that MJX prints when imported without optional Warp."""
   captured = io.StringIO()
   try:
     with contextlib.redirect_stdout(captured):

@@ -1,12 +1,10 @@
-"""Tiny runs and random batches, for tests and benchmarks.
+"""Tiny but complete runs and random batches, for tests and benchmarks.
 
-The runs are as small as a run can be and still be real. Their processes compile without
-optimization, because nobody waits for such a run to be fast.
+Processes of such runs compile without optimization, which takes longer than it saves.
 """
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 import subprocess
@@ -19,20 +17,15 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from apnpql_jax.config.schema import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
-from apnpql_jax.data import demonstrations
-from apnpql_jax.primitives.reset_bank import load_bank
 from apnpql_jax.runs import metrics
-from apnpql_jax.tasks import make_task
 from apnpql_jax.types import Observation, Slot, TimeStep, Transition
 
 ROOT = Path(__file__).resolve().parents[1]
 
-FAST_COMPILE = {
-  "xla_backend_optimization_level": 0,
-  "xla_llvm_disable_expensive_passes": True,
-}
-XLA_FLAGS = " ".join(f"--{name}={value}" for name, value in FAST_COMPILE.items())
-"""The same for the environment of a process."""
+XLA_FLAGS = (
+  "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+)
+"""Value of the environment variable that makes compilation fast."""
 
 TINY = TrainConfig(
   env=EnvConfig(worlds=4, bank_rows=256, obs="state", backend="native"),
@@ -42,8 +35,6 @@ TINY = TrainConfig(
     feature_dim=16,
     target_samples=4,
     policy_samples=4,
-    # Room for each algorithm: all must take steps from the first update on.
-    m_step_delay=0,
   ),
   replay=ReplayConfig(capacity=64, expert_steps=32, expert_share=0.5, batch_size=8),
   total_steps=64,
@@ -75,7 +66,7 @@ def start(
   log_compiles: bool = False,
   xla_flags: str = XLA_FLAGS,
 ) -> subprocess.Popen[bytes]:
-  """Trains in a new process, or goes on if ``run_dir`` is a run; stderr to ``said``."""
+  """Trains in a new process, or resumes if ``run_dir`` is a run; output to ``said``."""
   command = [sys.executable, "-m", "apnpql_jax", "train"]
   if (run_dir / "config.json").exists():
     command += ["--resume", str(run_dir)]
@@ -89,34 +80,14 @@ def start(
     )
 
 
-def write_demonstrations(path: Path) -> None:
-  """A file of four episodes of four instants, in which the arm holds still."""
-  env = TINY.env
-  task = make_task(env.task)
-  bank, _ = load_bank(task, env.bank_rows)
-  rows = np.arange(16) // 4
-  still = demonstrations.Demonstrations(
-    qpos=np.asarray(bank.qpos)[rows],
-    qvel=np.zeros((16, task.scene.model.nv), np.float32),
-    mocap_pos=np.asarray(bank.mocap_pos)[rows],
-    mocap_quat=np.asarray(bank.mocap_quat)[rows],
-    variant=np.asarray(bank.variant)[rows],
-    action=np.zeros((16, 7), np.float32),
-    first=np.arange(16) % 4 == 0,
-  )
-  period_s = env.control_period_s
-  demonstrations.save(path, still, task=env.task, control_period_s=period_s)
-
-
 def rows(run_dir: Path) -> list[dict[str, Any]]:
-  """Whole rows of the metrics of a run; none if it has not begun."""
-  files = [path for path in metrics.metric_files(run_dir) if path.exists()]
-  lines = [line for path in files for line in path.read_text().splitlines(True)]
-  return [json.loads(line) for line in lines if line.endswith("\n")]
+  """Returns the complete rows of a run's metrics; none if it has not begun."""
+  files = metrics.metric_files(run_dir)
+  return [dict(row) for path in files for row in metrics.read_rows(path)]
 
 
 def saved_arrays(run_dir: Path, step: int) -> dict[str, np.ndarray]:
-  """Every array of a checkpoint, read by Orbax alone."""
+  """Returns every array of a checkpoint, read by Orbax alone."""
   found = {}
   for item in ("learner", "rest", "replay"):
     with ocp.StandardCheckpointer() as reader:
@@ -127,7 +98,7 @@ def saved_arrays(run_dir: Path, step: int) -> dict[str, np.ndarray]:
 
 
 def saved_bytes(run_dir: Path, step: int) -> dict[str, bytes]:
-  """The bits of ``saved_arrays``."""
+  """Returns the bytes of ``saved_arrays``."""
   return {name: x.tobytes() for name, x in saved_arrays(run_dir, step).items()}
 
 
@@ -141,7 +112,7 @@ SMALL = AgentConfig(
   conv_channels=4,
   n_step=2,
 )
-"""Compiles in a few seconds, whichever row of Table I it is given."""
+"""Settings that compile in a few seconds for every row of Table I."""
 
 
 def random_batch(
@@ -152,14 +123,10 @@ def random_batch(
   windows: int = 0,
   instants: int = 0,
 ) -> Transition:
-  """Returns transitions of noise.
+  """Returns a batch of random transitions, with images if ``pixels``.
 
-  Args:
-    seed: of NumPy's generator.
-    batch: transitions B.
-    pixels: with images.
-    windows: N instants in ``Transition.window``; 0 for none.
-    instants: L instants per observation; 0 for single observations.
+  ``windows`` is the N of ``Transition.window``, 0 for none; ``instants`` the number of
+  instants per observation, 0 for single observations.
   """
   rng = np.random.default_rng(seed)
 

@@ -14,15 +14,9 @@ from jaxtyping import Bool, Float, UInt8
 Array = jax.Array
 Metrics = dict[str, jax.Array]
 
-ARM_DOF = 6
-"""Joints of the UR5e."""
-
-ACTION_DIM = ARM_DOF + 1
-"""Six desired joint velocities in rad/s within [-1, 1], then the gripper command
-in {0 = open, 1 = close}."""
-
-NUM_PRIMITIVES = 3
-"""Target object, desired goal, neutral configuration (paper Sec. V-A)."""
+ARM_DOF = 6  # joints of the UR5e
+ACTION_DIM = ARM_DOF + 1  # joint velocities in [-1, 1] rad/s, gripper (1 closes)
+NUM_PRIMITIVES = 3  # object, goal, neutral configuration (paper Sec. V-A)
 
 
 class Observation(struct.PyTreeNode):

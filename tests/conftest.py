@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from apnpql_jax import runtime
+from apnpql_jax import runtime, testing
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.engines import make_physics
 from apnpql_jax.sim.kinematics import Kinematics, make_kinematics
@@ -20,6 +20,10 @@ from apnpql_jax.tasks.task import ResetDraw
 
 # Figures are written to files; no test may need a display.
 os.environ.setdefault("MPLBACKEND", "Agg")
+# Compilation takes most of the time of the tests, so it does not optimize. Results
+# then differ in their last bits, so the tests keep their reset banks to themselves.
+os.environ["XDG_CACHE_HOME"] = str(testing.ROOT / ".pytest_cache" / "home")
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {testing.XLA_FLAGS}"
 runtime.configure()
 
 

@@ -1,8 +1,4 @@
-"""Augmentation of the images of a batch: random shifts and color jitter.
-
-The network sees each image slightly shifted and in other colors, so it cannot
-recognize states by single pixels.
-"""
+"""Random shifts and color jitter of images, so that no pixel identifies a state."""
 
 from __future__ import annotations
 
@@ -21,15 +17,10 @@ def augment(
   jitter: float,
   together: bool = False,
 ) -> Transition:
-  """Augments every image of every instant independently.
+  """Augments every image by ``shift_images`` and ``jitter_colors``; 0 turns one off.
 
-  Args:
-    key: random key.
-    batch: transitions [B, ...].
-    shift: largest shift along each axis, pixels; 0 for none.
-    jitter: largest relative change of brightness of each color channel; 0 for none.
-    together: observations are windows [B, L, ...]; augments all images of a window
-      alike, because an LSTM needs the differences between them.
+  Every instant is changed independently. With ``together``, all instants of a window
+  [B, L, ...] are changed alike, because an LSTM needs the differences between them.
   """
 
   def change(key: PRNGKeyArray, image: Array) -> Array:

@@ -15,20 +15,11 @@ import numpy as np
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.types import ARM_DOF, Array, Observation
 
-PATCH = 4
-"""Side of the pixel patches that the first convolution reads."""
-
-_STEP_SCALE = 7.0
-"""Scales a joint's change per control period (0.15 rad at most) to order one."""
-
-_POSITION_SCALE = 5.0
-"""Scales positions within reach of the arm (m) to order one, centimeters to 0.05."""
-
-_NEAR = 0.05, 0.2
-"""Distances from the tool (m) within which points are resolved in detail."""
-
-_SHARPNESS = 4.0
-"""Scales the scores of keypoints, so that each is local before training."""
+PATCH = 4  # side of the pixel patches that the first convolution reads
+_STEP_SCALE = 7.0  # per rad; a joint moves at most 0.15 rad in a control period
+_POSITION_SCALE = 5.0  # per m; brings positions within reach of the arm to order one
+_NEAR = 0.05, 0.2  # m; distances from the tool within which points are seen in detail
+_SHARPNESS = 4.0  # scale of scores that makes keypoints local before training
 
 
 class PixelEncoder(nn.Module):
@@ -36,8 +27,7 @@ class PixelEncoder(nn.Module):
 
   A 4x4 convolution with stride 4, then a 3x3 one with stride 2 (or 2x2 without
   overlap), both written as matrix products: inside a scan, where updates run, XLA:CPU
-  runs a convolution up to ten times slower. Images are padded with black to whole cells
-  of 8x8 pixels.
+  runs a convolution up to ten times slower. Images are padded to cells of 8x8 pixels.
   """
 
   channels: Sequence[int]
@@ -48,10 +38,7 @@ class PixelEncoder(nn.Module):
   def __call__(
     self, image: UInt8[Array, "*b H W 3"]
   ) -> tuple[Float[Array, "*b n"], Float[Array, "*b m"]]:
-    """Returns the map and the keypoints of both layers.
-
-    The map is flattened instead of pooled to keep the positions of objects.
-    """
+    """Returns the map, flattened to keep positions, and keypoints of both layers."""
     first, second = self.channels
     # Rearrange bytes, a quarter of the memory traffic, into cells of four patches, so
     # that the second layer finds its windows without strided copies.
@@ -68,10 +55,7 @@ class PixelEncoder(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-  """Two 3x3 convolutions around a skip connection (He et al. 2016b).
-
-  A relu precedes each convolution. The block starts as the identity.
-  """
+  """Two 3x3 convolutions around a skip; starts as the identity (He et al. 2016b)."""
 
   channels: int
 
@@ -79,53 +63,44 @@ class ResidualBlock(nn.Module):
   def __call__(self, x: Float[Array, "*b H W C"]) -> Float[Array, "*b H W C"]:
     """Adds the output of the convolutions to ``x``."""
     y = nn.Conv(self.channels, (3, 3), name="first")(nn.relu(x))
-    y = nn.Conv(
-      self.channels, (3, 3), name="second", kernel_init=nn.initializers.zeros
-    )(nn.relu(y))
+    zeros = nn.initializers.zeros
+    y = nn.Conv(self.channels, (3, 3), name="second", kernel_init=zeros)(nn.relu(y))
     return x + y
 
 
 class Encoder(nn.Module):
   """Feature extractor f^fe: observation -> phi (paper Sec. IV-B).
 
-  Keypoints of a camera are positions and join those of the robot. Each map has its own
-  projection, and the projections are summed, so that thousands of pixel features do not
-  outweigh a few dozen of the robot. The layer norm gives phi a fixed scale: heads that
-  read phi without training it (prior, alpha) need not follow growing activations.
+  Keypoints join the positions of the robot. Each map has its own projection, and the
+  projections are summed, so that thousands of pixel features do not outweigh a few
+  dozen of the robot. The layer norm gives phi a fixed scale: heads that read phi
+  without training it (prior, alpha) need not follow growing activations.
 
-  The optional LSTM reads these features of the last L instants of an episode. It starts
-  with an empty memory in acting and learning alike. Its last output is phi, which lies
-  within -1 and 1.
+  The optional LSTM reads the features of the last L instants of an episode, from an
+  empty memory in acting and learning alike. Its last output is phi.
   """
 
   config: AgentConfig
 
   @nn.compact
   def __call__(self, observation: Observation) -> Float[Array, "*b feature_dim"]:
-    """Computes phi; with an LSTM, from observations [*b, L, ...], oldest first.
-
-    Raises:
-      ValueError: for another number of instants than the LSTM reads.
-    """
+    """Computes phi; with an LSTM, from observations [*b, L, ...], oldest first."""
     config = self.config
     body = functools.partial(nn.Dense, config.feature_dim)
+    tool, objects = observation.tool, observation.objects
     state = [robot_inputs(observation.robot)]
-    for positions in (observation.tool, observation.objects):
-      if positions is not None:
-        state.append(_POSITION_SCALE * positions)
-    if observation.objects is not None and observation.tool is not None:
-      state.append(seen_from(observation.tool, observation.objects))
+    state += [_POSITION_SCALE * x for x in (tool, objects) if x is not None]
+    if objects is not None and tool is not None:
+      state.append(seen_from(tool, objects))
     # Encode the images: keypoints join the state, maps are projected.
     maps, channels = [], (config.patch_channels, config.conv_channels)
+    layers = (channels, config.conv_overlap, config.residual_blocks)
     for name, image, kind in (
       ("global_image", observation.global_image, config.global_features),
       ("wrist_image", observation.wrist_image, config.wrist_features),
     ):
       if image is not None:
-        camera = PixelEncoder(
-          channels, config.conv_overlap, config.residual_blocks, name=name
-        )
-        pixels, points = camera(image)
+        pixels, points = PixelEncoder(*layers, name=name)(image)
         if kind != "map":
           state.append(points)
         if kind != "keypoints":
@@ -145,16 +120,10 @@ class Encoder(nn.Module):
 
 
 def keypoints(scores: Float[Array, "*b R S P C"]) -> Float[Array, "*b 2*C"]:
-  """Locates the highest score of each channel (spatial soft-argmax).
+  """Locates each channel's highest score by a spatial soft-argmax (Levine et al. 2016).
 
-  This is the expected position under a softmax over the map (Levine et al. 2016). What
-  the layers after it learn in one part of the image therefore carries over to others.
-
-  Args:
-    scores: scores by cells of one position, or of the four 00, 01, 10, 11.
-
-  Returns:
-    Row and column of each channel within [-1, 1].
+  Returns row and column within [-1, 1], so what later layers learn in one part of the
+  image carries over to others. A cell has one position, or the four 00, 01, 10, 11.
   """
   *batch, rows, columns, parts, channels = scores.shape
   # Find the center of every position, as (row, column) within [-1, 1].
@@ -175,8 +144,7 @@ def seen_from(
 ) -> Float[Array, "*b 6*k"]:
   """Returns offsets of points from the tool (m), squashed to [-1, 1] at two scales.
 
-  Resolution is highest near the tool: a millimeter decides whether the hand can close,
-  and is lost in positions that span half a meter of table.
+  Near the tool, resolution is highest: a millimeter decides whether the hand can close.
   """
   away = points.reshape(*points.shape[:-1], -1, 3) - tool[..., None, :]
   squashed = jnp.stack([jnp.tanh(away / near) for near in _NEAR], axis=-1)
@@ -184,22 +152,17 @@ def seen_from(
 
 
 def robot_inputs(robot: Float[Array, "*b 21"]) -> Float[Array, "*b 33"]:
-  """Converts the last three robot states (rad) to network inputs of order one.
+  """Converts the last three robot states (rad), newest last, to inputs of order one.
 
-  Args:
-    robot: three times 6 joint angles and the gripper's, newest last.
-
-  Returns:
-    Newest state, sine and cosine of its joints, and the last two changes.
+  These are the newest state, sine and cosine of its joints, and the last two changes.
   """
   stack = robot.reshape(*robot.shape[:-1], 3, ARM_DOF + 1)
   newest = stack[..., -1, :]
   changes = _STEP_SCALE * (stack[..., 1:, :] - stack[..., :-1, :])
   joints = newest[..., :ARM_DOF]
-  return jnp.concatenate(
-    [newest, jnp.sin(joints), jnp.cos(joints), changes.reshape(*robot.shape[:-1], -1)],
-    axis=-1,
-  )
+  sine, cosine = jnp.sin(joints), jnp.cos(joints)
+  inputs = [newest, sine, cosine, changes.reshape(*robot.shape[:-1], -1)]
+  return jnp.concatenate(inputs, axis=-1)
 
 
 def space_to_depth(image: Array, size: int) -> Array:
@@ -218,12 +181,8 @@ def space_to_depth(image: Array, size: int) -> Array:
 def windows(cells: Float[Array, "*b R S 4 C"]) -> Float[Array, "*b R S 9*C"]:
   """Extracts 3x3 windows, stride 2 with zero padding, from a map stored by 2x2 cells.
 
-  Args:
-    cells: positions 00, 01, 10, 11 of each cell.
-
-  Returns:
-    The whole cell, then the touching column of its right neighbor, the touching row of
-    the neighbor below, and the touching corner of the diagonal neighbor.
+  A window is a cell (00, 01, 10, 11), then the touching column of its right neighbor,
+  the touching row of the neighbor below, and the touching corner of the diagonal one.
   """
   own = cells.reshape(*cells.shape[:-2], -1)
   border = [(0, 0)] * (cells.ndim - 4) + [(0, 1), (0, 1), (0, 0), (0, 0)]

@@ -17,10 +17,8 @@ from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.dists.gmm import GripperGMM
 from apnpql_jax.types import ACTION_DIM, NUM_PRIMITIVES, Array, Observation
 
-Params = dict[str, Any]
-
+Params = dict[str, Any]  # by group; groups that an algorithm lacks are absent
 GROUPS = ("encoder", "ap", "bp", "z", "alpha", "policy")
-"""Top level of the parameter tree; groups that an algorithm lacks are absent."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,9 +26,7 @@ class Networks:
   """The modules, one per group."""
 
   modules: dict[str, nn.Module]
-  value: Callable[[Float[Array, "*b n"]], Float[Array, "*b"]]
-  """Converts outputs of the value head to Q."""
-
+  value: Callable[[Float[Array, "*b n"]], Float[Array, "*b"]]  # from z's outputs to Q
   config: AgentConfig
 
   def init(self, key: PRNGKeyArray, observation: Observation) -> Params:
@@ -45,8 +41,7 @@ class Networks:
 
   def at(self, params: Params, observation: Observation) -> Heads:
     """Returns the heads at a batch of states; only this method runs the encoder."""
-    phi = self.apply("encoder", params, observation)
-    return Heads(self, params, phi)
+    return Heads(self, params, self.apply("encoder", params, observation))
 
   def apply(self, group: str, params: Params, *inputs: Any) -> Any:
     """Applies the module of ``group`` to ``inputs``."""
@@ -76,11 +71,10 @@ class Heads:
     return dataclasses.replace(self, params=params, phi=phi)
 
   def primitives(self) -> Float[Array, "*b 3 7"]:
-    """Predicts the action primitives theta^ap.
+    """Predicts the action primitives theta^ap: velocities in rad/s, logit of closing.
 
-    These are joint velocities in rad/s, unbounded, and the logit of closing the
-    gripper. The labels lie within [-1, 1], often at the bounds, where a squashed output
-    would lose its gradient.
+    They are unbounded: labels often lie at the bounds of [-1, 1], where a squashed
+    output would lose its gradient.
     """
     flat = self._apply("ap", self.phi)
     return flat.reshape(*self.phi.shape[:-1], NUM_PRIMITIVES, ACTION_DIM)
@@ -91,10 +85,9 @@ class Heads:
     Means are the predicted primitives, clipped to the action box (paper Sec. IV-A). The
     M-step trains the rest of theta and must move neither the means nor phi.
     """
-    learned_mean = self.config.prior_mean == "learned"
     return mixture_from_outputs(
       self._apply("bp", jax.lax.stop_gradient(self.phi)),
-      None if learned_mean else self.frozen().primitives(),
+      None if self.config.prior_mean == "learned" else self.frozen().primitives(),
       num=NUM_PRIMITIVES,
       min_std=self.config.min_std,
       initial_std=self.config.initial_std,
@@ -104,10 +97,7 @@ class Heads:
     )
 
   def policy(self) -> GripperGMM:
-    """Returns the parametric policy pi_psi, one component; trains only its group.
-
-    Like the prior it is not squashed: Q and the arm receive clipped draws.
-    """
+    """Returns the policy pi_psi, one component, not squashed; trains only its group."""
     return mixture_from_outputs(
       self._apply("policy", jax.lax.stop_gradient(self.phi)),
       None,

@@ -42,30 +42,23 @@ class Agent:
 
   networks: Networks
   evaluation: Evaluation
-
+  # (key, example observation with a batch axis) -> state before learning.
   init: Callable[[PRNGKeyArray, Observation], LearnerState]
-  """(key, example observation with a batch axis) -> state before learning."""
-
+  # (params, observation [B], key, greedy) -> actions f32[B, 7], info f32[B] each: the
+  # action's log_prob, which Retrace needs, and for diagnosis its q, the candidates'
+  # q_max and ess, and alpha. ``greedy`` is a Python bool.
   act: Callable[[Params, Observation, PRNGKeyArray, bool], tuple[Array, Metrics]]
-  """(params, observation [B], key, greedy) -> actions f32[B, 7], info f32[B] each.
-
-  Draws the policy's candidates and picks one by its weights. If greedy (a Python bool),
-  picks the one of highest value, or the mean of a parametric policy. Info has the
-  action's log_prob, which Retrace needs, and as diagnostics its q, the candidates'
-  q_max and ess, and alpha."""
-
+  # (state, transitions [B], key) -> state after one update, metrics f32[].
   update: Callable[
     [LearnerState, Transition, PRNGKeyArray], tuple[LearnerState, Metrics]
   ]
-  """(state, transitions [B], key) -> state after one update, metrics f32[]."""
 
 
 def make_agent(config: AgentConfig) -> Agent:
   """Builds the agent that ``config`` describes.
 
   Raises:
-    ConfigError: for an unknown algorithm, or for settings that cannot work, such as a
-      KL limit that the samples can never reach.
+    ConfigError: for an unknown algorithm or settings that cannot work.
   """
   validate(TrainConfig(agent=config), algorithms=epsilon_bounds())
   algorithm = algorithm_of(config)
@@ -76,15 +69,10 @@ def make_agent(config: AgentConfig) -> Agent:
   loss = functools.partial(total_loss, networks, algorithm, evaluation)
 
   def init(key: PRNGKeyArray, observation: Observation) -> LearnerState:
-    params = networks.init(key, observation)
-    nu = jnp.zeros(())
-    return LearnerState(
-      params=params,
-      target_params=jax.tree.map(jnp.copy, params),
-      nu=nu,
-      opt_state=optimizer.init({**params, "nu": nu}),
-      step=jnp.zeros((), jnp.int32),
-    )
+    params, nu = networks.init(key, observation), jnp.zeros(())
+    target_params = jax.tree.map(jnp.copy, params)
+    opt_state = optimizer.init({**params, "nu": nu})
+    return LearnerState(params, target_params, nu, opt_state, jnp.zeros((), jnp.int32))
 
   def act(
     params: Params, observation: Observation, key: PRNGKeyArray, greedy: bool = False
@@ -136,10 +124,9 @@ def make_agent(config: AgentConfig) -> Agent:
     metrics |= {f"grad_norm/{k}": optax.tree.norm(grads[k]) for k in groups}
     metrics["prior/nu"] = nu
     # Move the target network towards the new parameters.
+    rate = config.target_rate
     target_params = jax.tree.map(
-      lambda new, old: old + config.target_rate * (new - old),
-      params,
-      state.target_params,
+      lambda new, old: old + rate * (new - old), params, state.target_params
     )
     return LearnerState(params, target_params, nu, opt_state, state.step + 1), metrics
 
@@ -149,15 +136,11 @@ def make_agent(config: AgentConfig) -> Agent:
 def make_optimizer(
   config: AgentConfig, groups: tuple[str, ...]
 ) -> optax.GradientTransformation:
-  """Builds an Adam with a clipped global norm for each step of Algorithm 1.
-
-  A parametric policy has an Adam of its own, at the learning rate of the E-step.
-  """
+  """Builds an Adam with a clipped global norm for each step of Algorithm 1."""
 
   def adam(learning_rate: optax.ScalarOrSchedule) -> optax.GradientTransformation:
-    return optax.chain(
-      optax.clip_by_global_norm(config.max_grad_norm), optax.adam(learning_rate)
-    )
+    clip = optax.clip_by_global_norm(config.max_grad_norm)
+    return optax.chain(clip, optax.adam(learning_rate))
 
   def m_rate(count: Any) -> Any:
     return jnp.where(count < config.m_step_delay, 0.0, config.learning_rate_m)

@@ -1,8 +1,7 @@
 """The losses of the paper as functions of arrays, one number per state.
 
-Shapes are jaxtyping's and are not checked at run time: ``s`` candidate actions per
-state come first, ``*b`` are batch axes and ``n`` counts atoms. Time suffixes follow
-rlax: ``_tm1`` is the state acted upon, ``_t`` the state it led to.
+``s`` candidate actions per state come first, ``*b`` are batch axes and ``n`` counts
+atoms. ``_tm1`` is the state acted upon, ``_t`` the state it led to.
 
 ``stop_gradient``, here and in ``Heads``, keeps each loss from parameters that it must
 not train. One gradient of the sum of all losses therefore serves all steps of the
@@ -34,18 +33,12 @@ def ap_loss(
 
   L^ap = mean Huber(v - v*) / delta + mean cross-entropy(g, g*)
 
-  The Huber loss is quadratic below ``delta``, where the arm closes in on its target,
-  and linear above, where the labels of distant targets saturate.
-
-  Args:
-    predicted: velocities v in rad/s and the logit g of closing the gripper.
-    label: velocities v* in rad/s and the gripper command g* in {0, 1}.
-    delta: width of the quadratic part, rad/s.
+  v are velocities in rad/s and g is the logit of closing the gripper. The Huber loss is
+  quadratic below ``delta`` (rad/s), where the arm closes in on its target, and linear
+  above, where the labels of distant targets saturate.
   """
   velocity, close = predicted[..., :-1], predicted[..., -1]
-  # Average the velocity loss over primitives and joints, in units of delta.
   huber = optax.losses.huber_loss(velocity, label[..., :-1], delta=delta) / delta
-  # Average the gripper loss over primitives, in nats.
   entropy = optax.losses.sigmoid_binary_cross_entropy(close, label[..., -1])
   return jnp.mean(huber, axis=(-2, -1)) + jnp.mean(entropy, axis=-1)
 
@@ -57,23 +50,15 @@ def value_target(
   discount_t: Float[Array, "*b"],
   atoms: Float[Array, " n"],
 ) -> Float[Array, "*b n"]:
-  """Computes the distributional N-step target (paper Eq. 8, right side).
+  """Computes the distributional N-step target, without gradient (paper Eq. 8, right).
 
   Z-bar = project(r + gamma^N Z'(s_t, a)), a ~ q
 
-  Args:
-    logits_t: target network's Z' of the candidates at the bootstrap state.
-    weights_t: importance weights of the candidates.
-    reward_t: discounted sum of N rewards.
-    discount_t: gamma^N, zero where the episode terminated.
-    atoms: support of the returns.
-
-  Returns:
-    Probabilities of the atoms, without gradient.
+  ``logits_t`` are the target network's Z' of the candidates, r is the discounted sum of
+  N rewards, and the discount is zero where the episode terminated.
   """
   # Average over candidates first: the projection is linear, so one per state is enough.
   probs_t = jnp.sum(weights_t[..., None] * jax.nn.softmax(logits_t), axis=0)
-  # Shift and shrink the returns, and project them back onto the atoms.
   target = categorical.project(probs_t, reward_t, discount_t, atoms)
   return jax.lax.stop_gradient(target)
 
@@ -92,21 +77,12 @@ def retrace_target(
   q_t: Float[Array, "*b N"],
   trace_t: Float[Array, "*b N"],
 ) -> Float[Array, "*b"]:
-  """Computes the Retrace return of (s_0, a_0) over N instants (Munos 2016, Eq. 4).
+  """Computes the Retrace return G_0 of N instants, no gradient (Munos 2016, Eq. 4).
 
   G_{t-1} = r_t + gamma_t (V(s_t) + c_t (G_t - Q(s_t, a_t))), G_N = Q(s_N, a_N)
 
-  The last axis holds the instants t = 1..N; Q(s_0, a_0) cancels.
-
-  Args:
-    reward_t: reward received on arrival at t.
-    discount_t: gamma_t, zero where the episode terminated on arrival at t.
-    value_t: V(s_t) = E_pi[Q(s_t, .)].
-    q_t: Q(s_t, a_t).
-    trace_t: c_t = min(1, pi / mu), zero where the episode ended at t.
-
-  Returns:
-    G_0, without gradient.
+  The last axis holds the instants t = 1..N; Q(s_0, a_0) cancels. gamma_t is zero where
+  the episode terminated at t; the trace c_t is min(1, pi / mu), or zero where it ended.
   """
   target = q_t[..., -1]  # No data beyond the window, so no correction at its end.
   for t in reversed(range(reward_t.shape[-1])):
@@ -122,8 +98,7 @@ def alpha_loss(
 
   L^alpha = alpha epsilon + alpha log mean_i exp(Q_i / alpha), a_i ~ b
   """
-  q_tm1 = jax.lax.stop_gradient(q_tm1)
-  return boltzmann.dual(q_tm1, alpha_tm1, epsilon=epsilon)
+  return boltzmann.dual(jax.lax.stop_gradient(q_tm1), alpha_tm1, epsilon=epsilon)
 
 
 def kl_dual(
@@ -141,10 +116,7 @@ def weighted_nll(
   samples: Float[Array, " s *b 7"],
   weights: Float[Array, " s *b"],
 ) -> Float[Array, "*b"]:
-  """Computes -sum_i w_i log p(a_i) of unclipped actions to train p.
-
-  This is the KL from the weighted samples to p, up to a constant.
-  """
+  """Computes -sum_i w_i log p(a_i) of unclipped actions: KL(w || p) plus a constant."""
   samples, weights = jax.lax.stop_gradient((samples, weights))
   return -jnp.sum(weights * distribution.log_prob(samples), axis=0)
 
@@ -161,8 +133,7 @@ def m_step_loss(
 
   The first term is KL(q || b) up to a constant. The paper prints + nu H(b) but
   introduces the term for exploration, so entropy is rewarded here. H is a lower bound:
-  if it is above the floor, so is the entropy. ``samples`` are unclipped, ``weights``
-  those of q or of another policy.
+  if it is above the floor, so is the entropy.
   """
   nll = weighted_nll(prior, samples, weights)
   return nll - jax.lax.stop_gradient(nu) * prior.entropy_bound()

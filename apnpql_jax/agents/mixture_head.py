@@ -23,32 +23,23 @@ def mixture_from_outputs(
   min_prob: float,
   diagonal: bool = False,
 ) -> GripperGMM:
-  """Converts raw outputs of a head to a mixture around given means or its own.
+  """Converts raw outputs of a head to a mixture of ``num`` components.
+
+  The means are ``primitives`` f32[*b, K, 7], clipped to the action box, with logits of
+  closing the gripper to which an output is added; if None, outputs hold the means.
 
   Each row of a Cholesky factor is a direction times the standard deviation of that
-  joint. The deviation has a floor and a limit. Because the means are fixed, a value
-  that rises towards one side can make every M-step widen the component, until most
-  candidates are far from every action primitive and their values are guesses.
-  Components and gripper commands keep a minimum probability, because q cannot evaluate
-  actions that the prior no longer proposes. An entropy floor does not ensure this: a
-  wide Gaussian compensates for a gripper that never opens.
+  joint (rad/s), ``initial_std`` for outputs of zero, within limits. Because the means
+  are fixed, a value that rises towards one side can make every M-step widen the
+  component, until most candidates are far from every primitive and their values are
+  guesses. Gripper commands keep a probability of ``min_prob``, and so do components
+  while one of the others is at its limit, because q cannot evaluate actions that the
+  prior no longer proposes. An entropy floor does not ensure this: a wide Gaussian
+  compensates for a gripper that never opens.
 
   The limits are one-way clips, not squashing functions. In the first updates the values
   are noise, and Adam drives the outputs far to one side at a speed that does not depend
   on the gradient's size. A sigmoid or softmax never returns from there.
-
-  Args:
-    outputs: f32[*b, K * mixture_size(own_mean=primitives is None)].
-    primitives: f32[*b, K, 7], means in rad/s, clipped to the action box, and logits of
-      closing the gripper, to which an output is added; None if the outputs contain the
-      means.
-    num: components K.
-    min_std: floor of the standard deviation of each joint, rad/s.
-    initial_std: standard deviation for outputs of zero, rad/s.
-    max_std: limit of the standard deviation of each joint, rad/s.
-    min_prob: weight of a component at its floor while one of the others is at its
-      limit; smallest probability of a gripper command.
-    diagonal: ignore the outputs below the diagonal of the Cholesky factor.
   """
   dim = ARM_DOF
   outputs = outputs.reshape(*outputs.shape[:-1], num, -1)
@@ -59,13 +50,10 @@ def mixture_from_outputs(
   else:
     mean = jnp.clip(primitives[..., :dim], -1.0, 1.0)
     close = jnp.clip(primitives[..., dim], -surest, surest)
-  below_end = dim * (dim + 1) // 2
-  log_std, below, logits, gripper = jnp.split(
-    outputs, [dim, below_end, below_end + 1], axis=-1
-  )
-  log_std = one_way_clip(
-    log_std + math.log(initial_std), math.log(min_std), math.log(max_std)
-  )
+  end = dim * (dim + 1) // 2
+  log_std, below, logits, gripper = jnp.split(outputs, [dim, end, end + 1], axis=-1)
+  log_std = log_std + math.log(initial_std)
+  log_std = one_way_clip(log_std, math.log(min_std), math.log(max_std))
   widest = 0.5 * math.log((1.0 - (num - 1) * min_prob) / min_prob)
   logits = one_way_clip(logits[..., 0], -widest, widest)
   return GripperGMM(
@@ -93,13 +81,7 @@ def mixture_size(*, own_mean: bool) -> int:
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1, 2))
 def one_way_clip(x: Array, low: float, high: float) -> Array:
-  """Clips, with a gradient that only leads back: outward gradients are dropped.
-
-  Args:
-    x: f32[*b].
-    low: lower limit.
-    high: upper limit.
-  """
+  """Clips, with a gradient that only leads back: outward gradients are dropped."""
   return jnp.clip(x, low, high)
 
 

@@ -38,13 +38,12 @@ class Constant(nn.Module):
 class ValueHead(nn.Module):
   """Z_eta: values of many candidate actions per state.
 
-  The first layer is W_phi phi + W_a a; its larger part is computed once per state.
+  The first layer is W_phi phi + W_a a, with the larger part computed once per state.
   Candidates and states have separate axes, so that devices can divide the states.
   """
 
   hidden: Sequence[int]
-  initial: Sequence[float]
-  """Outputs before training, one per unit of the last layer."""
+  initial: Sequence[float]  # outputs before training, one per unit of the last layer
 
   @nn.compact
   def __call__(
@@ -68,8 +67,7 @@ class TwinValueHeads(nn.Module):
   """Two value heads that share only phi."""
 
   hidden: Sequence[int]
-  initial: Sequence[float]
-  """Outputs before training, those of the first head, then those of the second."""
+  initial: Sequence[float]  # of the first head, then of the second
 
   @nn.compact
   def __call__(
@@ -77,8 +75,6 @@ class TwinValueHeads(nn.Module):
   ) -> Float[Array, " s *b n"]:
     """Concatenates the outputs of both heads."""
     half = len(self.initial) // 2
-    heads = (
-      ValueHead(self.hidden, self.initial[:half], name="first"),
-      ValueHead(self.hidden, self.initial[half:], name="second"),
-    )
-    return jnp.concatenate([head(phi, actions) for head in heads], axis=-1)
+    first = ValueHead(self.hidden, self.initial[:half], name="first")
+    second = ValueHead(self.hidden, self.initial[half:], name="second")
+    return jnp.concatenate([first(phi, actions), second(phi, actions)], axis=-1)

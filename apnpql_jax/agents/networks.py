@@ -1,9 +1,8 @@
 """The networks, built from the settings (paper Fig. 2 and Sec. IV-B).
 
-The features phi are computed once per observation and reused for every candidate
-action. Each group of parameters can have its own optimizer: encoder, ap (predicted
-primitives), z (value), alpha and, depending on the algorithm, bp (the rest of the
-prior) and policy.
+The features phi are computed once per observation. The groups of parameters are
+encoder, ap (predicted primitives), z (value), alpha and, depending on the algorithm,
+bp (the rest of the prior) and policy.
 """
 
 from __future__ import annotations

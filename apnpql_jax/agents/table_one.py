@@ -1,8 +1,4 @@
-"""The rows of the paper's Table I.
-
-An algorithm is one choice per column. The learner calls the columns and refers to no
-algorithm by name.
-"""
+"""The rows of the paper's Table I, each one choice per column."""
 
 from __future__ import annotations
 
@@ -43,20 +39,11 @@ from apnpql_jax.errors import ConfigError, check_name
 class Algorithm:
   """One row of Table I; the columns are functions."""
 
-  regularizer: Callable[..., ActionDistribution]
-  """(heads, target network's heads) -> b, which limits the policy."""
-
-  policy: Callable[..., Candidates]
-  """(heads, b, key, num_samples, greedy) -> weighted candidates."""
-
-  regularizer_update: Callable[..., Losses]
-  """(heads, b, improved policy's candidates, batch, key, nu) -> losses of b and nu."""
-
-  policy_update: Callable[..., Improvement]
-  """(heads, b, key) -> improved policy, with the losses of psi and alpha."""
-
+  regularizer: Callable[..., ActionDistribution]  # (heads, target network's heads) -> b
+  policy: Callable[..., Candidates]  # (heads, b, key, num_samples, greedy)
+  regularizer_update: Callable[..., Losses]  # (heads, b, candidates, batch, key, nu)
+  policy_update: Callable[..., Improvement]  # (heads, b, key)
   policy_evaluation: Callable[[AgentConfig], Evaluation]
-  """settings -> value head, target and loss."""
 
   def groups(self, config: AgentConfig) -> tuple[str, ...]:
     """Returns the parameter groups that the columns read, in order of ``GROUPS``."""
@@ -72,47 +59,36 @@ ALGORITHMS = {
   # regularizer      policy          regularizer       policy      policy
   #                                  update            update      evaluation
   "ap_npql": Algorithm(
-    behavior_prior,  non_parametric, fit_candidates,   none,       Categorical,
-  ),
+    behavior_prior,  non_parametric, fit_candidates,   none,       Categorical),
   "ap_mpo": Algorithm(
-    behavior_prior,  parametric,     fit_candidates,   forward_kl, Categorical,
-  ),
+    behavior_prior,  parametric,     fit_candidates,   forward_kl, Categorical),
   "ap_sac": Algorithm(
-    behavior_prior,  parametric,     fit_candidates,   reverse_kl, Categorical,
-  ),
+    behavior_prior,  parametric,     fit_candidates,   reverse_kl, Categorical),
   "abm_mpo": Algorithm(
-    behavior_prior,  parametric,     fit_advantageous, forward_kl, TD0,
-  ),
+    behavior_prior,  parametric,     fit_advantageous, forward_kl, TD0),
   "svg_prior": Algorithm(
-    behavior_prior,  parametric,     fit_candidates,   reverse_kl, Retrace,
-  ),
+    behavior_prior,  parametric,     fit_candidates,   reverse_kl, Retrace),
   "mpo": Algorithm(
-    previous_policy, parametric,     no_update,        forward_kl, Retrace,
-  ),
+    previous_policy, parametric,     no_update,        forward_kl, Retrace),
   "sac": Algorithm(
-    uniform,         parametric,     no_update,        reverse_kl, ClippedDoubleQ,
-  ),
-  "ap_cem": Algorithm(
-    behavior_prior,  cem,            fit_candidates,   none,       ClippedDoubleQ,
-  ),
+    uniform,         parametric,     no_update,        reverse_kl, ClippedDoubleQ),
+  "ap_cem": Algorithm(  # not in the paper: QT-Opt's policy with b around primitives
+    behavior_prior,  cem,            fit_candidates,   none,       ClippedDoubleQ),
 }  # fmt: skip
-"""The last row is not in the paper: QT-Opt's policy with b around action primitives."""
 
-EVALUATIONS = {
+EVALUATIONS = {  # values of ``agent.policy_evaluation`` other than "row"
   "categorical": Categorical,
   "td0": TD0,
   "retrace": Retrace,
   "clipped_double_q": ClippedDoubleQ,
 }
-"""Values of ``agent.policy_evaluation`` other than "row"."""
 
 
 def algorithm_of(config: AgentConfig) -> Algorithm:
   """Returns the row that ``config`` names, with the columns that it replaces.
 
   Raises:
-    ConfigError: for an unknown row; the message lists the valid names. Also for Retrace
-      with a policy without a density.
+    ConfigError: for an unknown row, or Retrace with a policy that has no density.
   """
   check_name("agent.algorithm", config.algorithm, tuple(ALGORITHMS))
   row = ALGORITHMS[config.algorithm]
@@ -130,10 +106,7 @@ def algorithm_of(config: AgentConfig) -> Algorithm:
 
 
 def epsilon_bounds() -> dict[str, tuple[str, ...]]:
-  """Returns per row the settings with the numbers of candidates that q weighs.
-
-  ``epsilon`` must lie below the log of each of them.
-  """
+  """Returns per row the settings, q's sample counts, whose log must exceed epsilon."""
   return {
     name: ("target_samples",) * (row.policy is non_parametric)
     + ("policy_samples",) * (row.policy_update is not reverse_kl)

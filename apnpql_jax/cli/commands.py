@@ -15,9 +15,9 @@ from apnpql_jax.cli.options import Collect, Convert, Evaluate, List, Repeat, Tra
 from apnpql_jax.config import files
 from apnpql_jax.config.checks import BACKENDS, validate
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
-from apnpql_jax.console import say
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs import run_folder
+from apnpql_jax.runs.console import say
 
 if TYPE_CHECKING:
   from jax.sharding import Mesh

@@ -16,8 +16,8 @@ from apnpql_jax.cli import commands, options
 from apnpql_jax.cli.commands import Json
 from apnpql_jax.cli.options import Train, parse
 from apnpql_jax.config import files
-from apnpql_jax.console import say
 from apnpql_jax.errors import ConfigError, UserError, check_name
+from apnpql_jax.runs.console import say
 from apnpql_jax.runs.signals import Signals
 from apnpql_jax.version import __version__
 
@@ -45,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     with Signals("interrupted"), _json_only(parsed.json) as write:
       result = command(parsed)
       if result:  # Empty in all but the first of several processes.
-        write(_to_json(result) if parsed.json else _show(result))
+        write(json.dumps(_plain(result)) if parsed.json else _show(result))
     return 0
   except UserError as error:
     say(f"apnpql: {' '.join(str(error).split())}")
@@ -93,10 +93,6 @@ def _json_only(enabled: bool) -> Generator[Callable[[str], Any], None, None]:
     sys.stdout.flush()
     os.dup2(stdout, 1)
     os.close(stdout)
-
-
-def _to_json(result: Json) -> str:
-  return json.dumps(_plain(result), allow_nan=False)
 
 
 def _plain(value: Any) -> Any:

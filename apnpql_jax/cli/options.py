@@ -22,23 +22,31 @@ def _default_hint(text: str) -> object:
 
 
 _Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
-_Json = Annotated[
-  _Flag, tyro.conf.arg(help="Print only one JSON object on standard output.")
-]
 _OfPreset = Annotated[str | None, _default_hint("(default: as in the preset)")]
 _Count = Annotated[int | None, _default_hint("")]
 _File = Annotated[Path | None, _default_hint("")]
-_Video = Annotated[
-  Path | None,
-  tyro.conf.arg(
-    help="Also write a video of the first four episodes to this .mp4 or .gif file.",
-    help_behavior_hint="",
-  ),
-]
 
 
 @dataclasses.dataclass(frozen=True)
-class Train:
+class _Command:
+  json: _Flag = False
+  """Print only one JSON object on standard output."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Play(_Command):
+  episodes: int = 200
+  """Number of episodes."""
+
+  seed: int = 0
+  """Random seed of the episodes and of the policy or noise."""
+
+  video: _File = None
+  """Also write a video of the first four episodes to this .mp4 or .gif file."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Train(_Command):
   """Trains an agent: apnpql train PRESET [options].
 
   Every setting of the preset can be overridden, e.g. --agent.epsilon 0.5.
@@ -80,15 +88,13 @@ class Train:
   process: _Count = None
   """Index of this process, from 0."""
 
-  json: _Json = False
-
   config: Annotated[TrainConfig, tyro.conf.arg(name="")] = dataclasses.field(
     default_factory=TrainConfig
   )
 
 
 @dataclasses.dataclass(frozen=True)
-class Evaluate:
+class Evaluate(_Play):
   """Plays held-out episodes with a trained agent: apnpql evaluate RUN [options]."""
 
   run: tyro.conf.Positional[str] = ""
@@ -97,35 +103,19 @@ class Evaluate:
   checkpoint: str = "newest"
   """Checkpoint: newest, best (highest success rate in training) or its step."""
 
-  episodes: int = 200
-  """Number of episodes."""
-
-  seed: int = 0
-  """Random seed of the episodes and the policy."""
-
   greedy: _Flag = False
   """Take the best candidate, or a parametric policy's mean, instead of sampling."""
 
   backend: Annotated[str | None, _default_hint("(default: as in training)")] = None
   """Physics engine: auto, mjx or native."""
 
-  video: _Video = None
-
-  json: _Json = False
-
 
 @dataclasses.dataclass(frozen=True)
-class Collect:
+class Collect(_Play):
   """Plays episodes with the scripted expert: apnpql collect TASK [options]."""
 
   task: tyro.conf.Positional[str] = ""
   """Task to play; `apnpql list` shows all."""
-
-  episodes: int = 200
-  """Number of episodes."""
-
-  seed: int = 0
-  """Random seed of the episodes and the noise."""
 
   backend: str = "auto"
   """Physics engine: auto, mjx or native."""
@@ -136,13 +126,9 @@ class Collect:
   save: _File = None
   """Also save as many episodes from training resets as a file of demonstrations."""
 
-  video: _Video = None
-
-  json: _Json = False
-
 
 @dataclasses.dataclass(frozen=True)
-class Convert:
+class Convert(_Command):
   """Converts a recording to demonstrations: apnpql convert REC.npz TASK OUT.npz."""
 
   recording: tyro.conf.Positional[str] = ""
@@ -154,27 +140,21 @@ class Convert:
   out: tyro.conf.Positional[str] = ""
   """File to write, for --replay.demonstrations."""
 
-  json: _Json = False
-
 
 @dataclasses.dataclass(frozen=True)
-class Repeat:
+class Repeat(_Command):
   """Repeats an update that was not finite: apnpql repeat RUN/faults/step_<n>.npz."""
 
   file: tyro.conf.Positional[str] = ""
   """File that a run wrote when it stopped, still in its run folder."""
 
-  json: _Json = False
-
 
 @dataclasses.dataclass(frozen=True)
-class List:
+class List(_Command):
   """Lists the tasks, presets, algorithms and backends."""
 
   contacts: _Flag = False
   """Report contacts and physics speed of every scene instead; compiles for minutes."""
-
-  json: _Json = False
 
 
 def parse(kind: type[T], name: str, argv: Sequence[str], default: T | None = None) -> T:

@@ -78,18 +78,18 @@ def validate(
 
   Args:
     config: Configuration to check.
-    tasks: Valid task names; not checked if None.
+    tasks: Valid task names. Like the next two, not checked if None.
     algorithms: Valid algorithm names, each with the agent settings (numbers of
-      candidates) whose logarithm bounds epsilon; not checked if None.
-    memory_bytes: Memory of one device, which the replays must fit into; not checked if
-      None.
+      candidates) whose logarithm bounds epsilon.
+    memory_bytes: Memory of one device, for the replays.
     devices: Number of devices that share the worlds and batches.
 
   Raises:
     ConfigError: A setting is invalid. The one-line message names it and the valid
       choices or the fix.
   """
-  _check_values(dict(codec.flatten(config)))
+  values = dict(codec.flatten(config))
+  _check_values(values)
   if tasks is not None:
     check_name("env.task", config.env.task, tasks)
   if algorithms is not None:
@@ -100,12 +100,9 @@ def validate(
     _check_epsilon(config.agent, algorithms[config.agent.algorithm])
   _check_expert(config)
   _check_replay(config, None if memory_bytes is None else memory_bytes * devices)
-  for name, number in (
-    ("env.worlds", config.env.worlds),
-    ("replay.batch_size", config.replay.batch_size),
-  ):
-    if number % devices:
-      raise ConfigError(f"{name}={number} must be a multiple of the {devices} devices")
+  for name in ("env.worlds", "replay.batch_size"):
+    if (n := values[name]) % devices:
+      raise ConfigError(f"{name}={n} must be a multiple of the {devices} devices")
 
 
 def replay_bytes(config: TrainConfig) -> int:
@@ -164,12 +161,9 @@ def _check_agent(agent: AgentConfig) -> None:
       raise ConfigError(f"agent.{name}={getattr(agent, name)} must be within (0, 1]")
   if not agent.hidden or min(agent.hidden) < 1 or max(agent.hidden) >= 2**31:
     raise ConfigError(f"agent.hidden={agent.hidden} must be positive layer widths")
-  if not 0.0 < agent.min_prob < 1.0 / 3.0:
-    raise ConfigError(f"agent.min_prob={agent.min_prob} must be within (0, 1/3)")
-  if not 0.0 < agent.policy_min_prob < 0.5:
-    raise ConfigError(
-      f"agent.policy_min_prob={agent.policy_min_prob} must be within (0, 1/2)"
-    )
+  for name, components in (("min_prob", 3), ("policy_min_prob", 2)):
+    if not 0.0 < (prob := getattr(agent, name)) < 1.0 / components:
+      raise ConfigError(f"agent.{name}={prob} must be within (0, 1/{components})")
   if agent.v_min >= agent.v_max:
     raise ConfigError(
       f"agent.v_min={agent.v_min} must be below agent.v_max={agent.v_max}"

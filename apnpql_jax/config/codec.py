@@ -42,17 +42,12 @@ def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
       yield prefix + field.name, value
 
 
-def to_json(config: Any) -> str:
-  """Returns the nested dataclass as indented JSON."""
-  return json.dumps(dataclasses.asdict(config), indent=2) + "\n"
-
-
 def ignore(line: str) -> None:
   """Discards a message."""
 
 
 def from_json(cls: type[T], text: str, warn: Callable[[str], None] = ignore) -> T:
-  """Parses the output of ``to_json``, which may predate some ``added`` fields.
+  """Parses a nested dataclass, whose JSON may predate some ``added`` fields.
 
   Calls ``warn`` with one line that lists these fields, if any.
 

@@ -7,7 +7,9 @@ are next to it. Names are plain words, so that a name cannot lead out of its fol
 from __future__ import annotations
 
 from collections.abc import Callable
+import dataclasses
 import importlib.util
+import json
 from pathlib import Path
 import re
 from typing import Any
@@ -61,7 +63,7 @@ def mjcf_path(name: str) -> Path:
 
 def config_to_json(config: TrainConfig) -> str:
   """Returns the configuration as indented JSON, nested like the dataclasses."""
-  return codec.to_json(config)
+  return json.dumps(dataclasses.asdict(config), indent=2) + "\n"
 
 
 def config_from_json(

@@ -1,7 +1,6 @@
 """Demonstration files: episodes of states and actions, checked on reading.
 
-A file holds the states of the scene and the actions. Images, rewards and labels are
-computed from them, as in any world. ``docs/demonstrations.md`` describes the format.
+Images, rewards and labels are computed from them; see ``docs/demonstrations.md``.
 """
 
 from __future__ import annotations
@@ -20,9 +19,7 @@ from apnpql_jax.types import ACTION_DIM
 
 FORMAT = "apnpql-demonstrations"
 VERSION = 1
-
-_SLACK = 0.05
-"""rad; tolerance beyond a joint limit, because MuJoCo's limits are soft."""
+_SLACK = 0.05  # rad; tolerance beyond a joint limit, because MuJoCo's limits are soft
 
 
 class Demonstrations(NamedTuple):
@@ -45,21 +42,13 @@ class Demonstrations(NamedTuple):
 def save(
   path: Path, demos: Demonstrations, *, task: str, control_period_s: float
 ) -> dict[str, Any]:
-  """Writes a demonstration file.
-
-  Returns:
-    the name of the file and the numbers of instants and demonstrations.
+  """Writes a demonstration file; returns its name and counts.
 
   Raises:
     FileError: the file cannot be written.
   """
-  arrays: dict[str, Any] = {
-    "format": FORMAT,
-    "version": VERSION,
-    "task": task,
-    "control_period_s": control_period_s,
-    **demos._asdict(),
-  }
+  arrays: dict[str, Any] = {"format": FORMAT, "version": VERSION, "task": task}
+  arrays |= {"control_period_s": control_period_s, **demos._asdict()}
   try:
     with path.open("wb") as file:  # NumPy appends a suffix to file names.
       np.savez_compressed(file, **arrays)
@@ -73,8 +62,7 @@ def load(path: Path, task: Task, control_period_s: float) -> Demonstrations:
   """Reads and checks a demonstration file.
 
   Raises:
-    FileError: the file has another format, version, task or control period, or a state
-      that the scene rejects.
+    FileError: another format, version, task or control period, or an invalid state.
   """
   arrays = npz.read(path, limit=devices.host_memory() or 1 << 32)
   fields = Demonstrations._fields
@@ -103,7 +91,7 @@ def check(demos: Demonstrations, scene: Scene) -> None:
   """Checks shapes and values against the scene.
 
   Raises:
-    FileError: a value is invalid; the message names the array and the first instant.
+    FileError: names the array and the first instant of an invalid value.
   """
   model, n = scene.model, demos.first.size
   variants = min((len(v) for v in scene.variants.values()), default=1)
@@ -123,8 +111,7 @@ def check(demos: Demonstrations, scene: Scene) -> None:
     _reject(name, "is not finite", ~np.isfinite(array))
   if not n or not demos.first[0]:
     raise FileError("the first instant must begin an episode")
-  addresses = model.jnt_qposadr[free_joints(model)]
-  quats = [demos.qpos[:, i + 3 : i + 7] for i in addresses]
+  quats = [demos.qpos[:, i + 3 : i + 7] for i in model.jnt_qposadr[free_joints(model)]]
   quats += list(np.moveaxis(demos.mocap_quat, 1, 0))
   for quat in quats:
     off = abs(np.linalg.norm(quat, axis=-1) - 1) > 1e-3
@@ -134,9 +121,8 @@ def check(demos: Demonstrations, scene: Scene) -> None:
   joints = demos.qpos[:, model.jnt_qposadr[limited]]
   beyond = (joints < low - _SLACK) | (joints > high + _SLACK)
   _reject("qpos", "is beyond the limit of a joint", beyond)
-  _reject(
-    "variant", "is not one of the scene's", ~np.isin(demos.variant, range(variants))
-  )
+  unknown = ~np.isin(demos.variant, range(variants))
+  _reject("variant", "is not one of the scene's", unknown)
   gripper = demos.action[:, -1]
   wrong = (abs(demos.action[:, :-1]) > 1.0).any(1) | ~np.isin(gripper, (0.0, 1.0))
   _reject("action", "is not within [-1, 1] rad/s and {0, 1}", wrong)

@@ -12,22 +12,18 @@ import numpy as np
 
 from apnpql_jax.errors import FileError, UserError, one_line
 
+# Exceptions raised for malformed archives.
 _ERRORS = (OSError, ValueError, EOFError, KeyError, RuntimeError, MemoryError)
 _ERRORS += (NotImplementedError, zipfile.BadZipFile, zlib.error)
 _ERRORS += (LookupError, SyntaxError, TypeError, tokenize.TokenError)
-"""Exceptions raised for malformed archives."""
 
 
 def read(path: Path, *, limit: int) -> dict[str, np.ndarray]:
   """Reads all arrays of an archive without executing anything in it.
 
-  Args:
-    path: the file.
-    limit: maximum size of all arrays together, bytes.
-
   Raises:
     FileError: the file is no archive of arrays, is damaged, holds Python objects, or
-      exceeds ``limit``.
+      takes more than ``limit`` bytes.
   """
   try:
     with zipfile.ZipFile(path) as archive:

@@ -1,8 +1,7 @@
 """Conversion of recorded joint trajectories to demonstrations.
 
-A recording holds the positions of the joints and the poses of the objects. Velocities
-and actions follow from them. Images are not taken from recordings but rendered from the
-poses, as in training.
+A recording holds the positions of the joints and the poses of the objects. Velocities,
+actions and images are computed from them.
 """
 
 from __future__ import annotations
@@ -19,25 +18,14 @@ from apnpql_jax.errors import FileError, UserError
 from apnpql_jax.sim.physics import MAX_VELOCITY
 from apnpql_jax.sim.scene import Scene, free_joints
 
-_STILL = 0.02
-"""Change of the gripper per period, relative to its travel, that keeps its command."""
-
-_LONGEST_GAP_S = 1.0
-"""Longest interpolated gap between two samples."""
-
-_LARGEST = 1e30
-"""Largest magnitude of a number, far below the limit of float32."""
-
+_STILL = 0.02  # change per period of the gripper (0 to 1) that keeps its command
+_LONGEST_GAP_S = 1.0  # between two samples; interpolated
+_LARGEST = 1e30  # magnitude of a number, far below the limit of float32
 _FINGERS = ("finger_r1", "finger_r2", "finger_l1", "finger_l2")
 
 
 def convert(path: Path, scene: Scene, *, period_s: float) -> Demonstrations:
-  """Reads a recording and samples it once per control period.
-
-  Args:
-    path: an ``.npz`` file, see ``docs/demonstrations.md``.
-    scene: the scene whose bodies the recording must cover.
-    period_s: control period, s.
+  """Reads a recording (``docs/demonstrations.md``) and samples it every ``period_s``.
 
   Raises:
     FileError: poses are missing, a shape is wrong, or the arm moves too fast.
@@ -124,8 +112,7 @@ def _positions(
   qpos = np.tile(model.qpos0, (n, 1))
   qpos[:, scene.arm_qpos] = poses["joints"]
   closed = poses["gripper"].clip(0.0, 1.0)
-  for finger in _FINGERS:
-    joint = model.joint(finger)
+  for joint in map(model.joint, _FINGERS):
     qpos[:, joint.qposadr[0]] = closed * joint.range[1]
   mocap_pos, mocap_quat = np.zeros((n, model.nmocap, 3)), np.zeros((n, model.nmocap, 4))
   for name, (kind, index) in _bodies(model).items():
@@ -139,11 +126,7 @@ def _positions(
 
 
 def _actions(joints: np.ndarray, gripper: np.ndarray, period_s: float) -> np.ndarray:
-  """Returns the actions f32[n, 7] that lead from each instant to the next.
-
-  Raises:
-    FileError: the arm moves faster than any action.
-  """
+  """Returns the actions f32[n, 7] that lead from each instant to the next."""
   action = np.zeros((len(joints), 7), np.float32)
   velocity = np.diff(joints, axis=0) / period_s
   if abs(velocity).max(initial=0.0) > 1.05 * MAX_VELOCITY:

@@ -2,8 +2,7 @@
 
 The slot at time t holds (TimeStep_t, action_t). Reward and end flags of TimeStep_t
 belong to the arrival at t. The slot after a last one is the reset of the next episode.
-N-step transitions, and windows of observations for an LSTM, are assembled at sampling
-time, so no frame is stored twice.
+N-step transitions and windows for an LSTM are assembled at sampling time.
 """
 
 from __future__ import annotations
@@ -19,8 +18,7 @@ import numpy as np
 
 from apnpql_jax.types import Array, Slot, Transition
 
-_CANDIDATES = 4
-"""Candidate starts per row; terminal steps (1 in 20 to 94) are rejected."""
+_CANDIDATES = 4  # starts drawn per row; terminal steps (1 in 20 to 94) are rejected
 
 
 class Replay(struct.PyTreeNode):
@@ -32,13 +30,7 @@ class Replay(struct.PyTreeNode):
 
 
 def create(example_slot: Slot, length: int, worlds: int) -> Replay:
-  """Creates an empty ring.
-
-  Args:
-    example_slot: shapes and dtypes of one slot of one world, without batch axes.
-    length: time steps.
-    worlds: worlds per time step.
-  """
+  """Creates an empty ring; the example is one slot of one world, without batch axes."""
   slots = jax.tree.map(
     lambda x: jnp.zeros((length, worlds, *x.shape), x.dtype), example_slot
   )
@@ -47,18 +39,10 @@ def create(example_slot: Slot, length: int, worlds: int) -> Replay:
 
 
 def add(replay: Replay, chunk: Slot) -> Replay:
-  """Writes a chunk over the oldest time steps.
+  """Writes a chunk [T, worlds, ...], oldest first, over the oldest time steps.
 
-  The write is in place if the replay is donated and is sampled only afterwards.
-
-  Args:
-    replay: the ring.
-    chunk: [T, worlds, ...], oldest first; continues the previous chunk. All chunks of
-      a ring have the same T, so no write crosses its end.
-
-  Raises:
-    ValueError: at trace time; T does not divide the length, or a leaf differs in shape
-      or dtype from the ring.
+  All chunks of a ring have the same T, so no write crosses its end. The write is in
+  place if the replay is donated and is sampled only afterwards.
   """
   length, steps = replay.slots.action.shape[0], chunk.action.shape[0]
   if not steps or length % steps:
@@ -80,10 +64,9 @@ def add(replay: Replay, chunk: Slot) -> Replay:
 
 
 def exclude(replay: Replay, steps: Int[Array, " worlds"]) -> Replay:
-  """Marks the newest ``steps`` slots of each world as truncated.
+  """Marks the newest ``steps`` slots of each world as truncated to exclude an episode.
 
-  No transition starts at a last slot or reaches beyond one, so an episode that is
-  excluded from its first slot on is never drawn.
+  No transition starts at a last slot or reaches beyond one, so it is never drawn.
   """
   length = replay.slots.action.shape[0]
   age = (replay.cursor - 1 - jnp.arange(length)) % length
@@ -95,10 +78,7 @@ def exclude(replay: Replay, steps: Int[Array, " worlds"]) -> Replay:
 
 @jax.jit
 def episodes(replay: Replay) -> tuple[Int[Array, ""], Int[Array, ""]]:
-  """Counts the successes among the finished episodes, and all finished episodes.
-
-  An excluded episode, whose slots are all last, counts once.
-  """
+  """Counts successes and finished episodes; an excluded one counts once as finished."""
   timestep = replay.slots.timestep
   ends = timestep.last & ~jnp.roll(timestep.last, 1, axis=0)
   return jnp.sum(ends & timestep.terminated), jnp.sum(ends)
@@ -124,22 +104,11 @@ def sample(
   A valid start is a slot that is not last, has N successors and, for windows of L
   observations, L - 1 predecessors. Let m be the first k <= N with a last step at t+k,
   or N. Then reward_t is sum_{k=1..m} gamma^(k-1) r_{t+k}, and discount_t is gamma^m, or
-  zero if t+m terminated.
+  zero if t+m terminated. The weight is zero where no valid start was found, because the
+  ring is too short or all candidates of the batch were used up.
 
-  Args:
-    replay: the ring.
-    key: PRNG key.
-    batch_size: transitions B.
-    n_step: N, at least 1.
-    gamma: discount per control period.
-    windows: also return the N instants after the start in ``Transition.window``. Past
-      the end of an episode they repeat that end.
-    instants: L; observations are [B, L, ...], as in ``EnvState.observation``. 0 for
-      single observations.
-
-  Returns:
-    [B, ...]. The weight is zero where no valid start was found, because the ring is too
-    short or all candidates of the batch were used up.
+  With ``windows``, ``Transition.window`` holds the N instants after the start; they
+  repeat the end of an episode. With ``instants`` L > 0, observations are [B, L, ...].
   """
   before = max(instants - 1, 0)
   time, world, valid = _draw_starts(replay, key, batch_size, n_step, before)
@@ -192,10 +161,7 @@ def sample_mixed(
   """Draws a batch from both replays: agent rows first, then ``expert_count`` rows.
 
   The counts are fixed. Rows of a replay that is still too short have weight zero, since
-  replacing them would change the configured share. See ``sample`` for the arguments.
-
-  Raises:
-    ValueError: the batch has expert rows, but ``expert_replay`` is None.
+  replacing them would change the configured share.
   """
   from_expert = expert_count(batch_size, expert_share)
   if from_expert and expert_replay is None:

@@ -1,7 +1,6 @@
 """Distributions over actions: their interface and the uniform one on the action box.
 
-Shapes in annotations are jaxtyping's and are not checked at run time: ``*b`` are batch
-axes, ``*sb`` sample axes followed by batch axes, ``d`` the continuous dimensions.
+In shapes, ``*b`` are batch axes, ``*sb`` sample axes before them, ``d`` joints.
 """
 
 from __future__ import annotations
@@ -35,8 +34,7 @@ class ActionDistribution(
 class UniformBox(ActionDistribution):
   """Uniform distribution over [-1, 1]^D x {0, 1}, the regularizer of plain entropy.
 
-  KL(pi || uniform) is log_volume - H(pi). The density is the same outside the box,
-  because actions are clipped to the box before they are used.
+  The density is the same outside the box, because actions are clipped before use.
   """
 
   batch: tuple[int, ...] = struct.field(pytree_node=False)

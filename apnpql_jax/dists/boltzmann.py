@@ -1,8 +1,4 @@
-"""The non-parametric policy q = b exp(Q / alpha) / Z on samples of the prior b.
-
-All functions take the values ``q_values`` of S candidates per state, drawn from b, on
-the leading axis, and temperatures ``alpha`` > 0 (paper Sec. III-B).
-"""
+"""The non-parametric policy q = b exp(Q / alpha) / Z on samples of b (Sec. III-B)."""
 
 from __future__ import annotations
 
@@ -37,12 +33,10 @@ def dual(
 ) -> Float[Array, "*b"]:
   """Returns the dual of max_q E_q[Q] subject to KL(q || b) <= epsilon (paper Eq. 7).
 
-  The dual is alpha epsilon + alpha log mean_i exp(Q_i / alpha). It is convex in alpha
-  and its slope is epsilon - KL(q || b), so the limit holds exactly at its minimum.
+  It is convex in alpha, with slope epsilon - KL(q || b), which is zero at the limit.
   """
-  log_mean = jax.nn.logsumexp(q_values / alpha[None], axis=0) - math.log(
-    q_values.shape[0]
-  )
+  log_sum = jax.nn.logsumexp(q_values / alpha[None], axis=0)
+  log_mean = log_sum - math.log(q_values.shape[0])
   return alpha * epsilon + alpha * log_mean
 
 

@@ -27,18 +27,8 @@ def project(
   """Projects the distribution of ``reward + discount * z`` back onto the atoms.
 
   The projection is linear in ``probs``. Averaging over candidate actions first
-  therefore leaves one projection per state (paper Eq. 8, right side).
-
-  Args:
-    probs: distribution of the return z at the bootstrap state, already averaged over
-      actions.
-    reward: reward per state.
-    discount: discount per state, zero where the episode terminated.
-    atoms: support, evenly spaced and increasing.
-
-  Returns:
-    Probabilities with the same mass as ``probs``; returns beyond the support count at
-    its ends.
+  therefore leaves one projection per state (paper Eq. 8, right side). Atoms are evenly
+  spaced and increasing. Returns beyond them count at their ends.
   """
   shape = (1,) * reward.ndim + atoms.shape
   moved = reward[..., None] + discount[..., None] * atoms.reshape(shape)
@@ -59,13 +49,9 @@ def cross_entropy(
 def broadest_logits(
   expected: float, atoms: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-  """Returns logits of the maximum-entropy distribution with a given mean.
+  """Returns logits of the maximum-entropy distribution of mean ``expected``.
 
   The logits are linear in the atoms (an exponential family); bisection finds the slope.
-
-  Args:
-    expected: mean, strictly between the ends of ``atoms``.
-    atoms: support, evenly spaced and increasing.
   """
   unit = (atoms - atoms[0]) / (atoms[-1] - atoms[0])
   goal = (expected - atoms[0]) / (atoms[-1] - atoms[0])

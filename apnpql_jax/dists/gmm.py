@@ -1,14 +1,12 @@
 """Gaussian mixtures over arm velocities with a gripper command per component.
 
 Behavior priors and parametric policies are such mixtures. Each component is a
-full-covariance Gaussian over the continuous part of an action times a Bernoulli over
-the gripper (paper Sec. IV-A). Shapes are written as in ``action``, with ``k`` for the
-components.
+full-covariance Gaussian times a Bernoulli over the gripper (paper Sec. IV-A). Shapes
+are written as in ``action``, with ``k`` for the components.
 
-Samples and densities are written out in plain array operations. distrax's samplers
-draw noise for every component although only one is used. Its triangular normal makes
-batched LAPACK calls, which are slow for thousands of 6x6 matrices on XLA:CPU and can
-deadlock there.
+Samples and densities are plain array operations. distrax's samplers draw noise for
+every component although only one is used. Its triangular normal makes batched LAPACK
+calls, which are slow for thousands of 6x6 matrices on XLA:CPU and can deadlock there.
 """
 
 from __future__ import annotations
@@ -28,17 +26,10 @@ _LOG_2PI = math.log(2.0 * math.pi)
 class GripperGMM(ActionDistribution):
   """Mixture of K components over D continuous dimensions and one binary gripper."""
 
-  logits: Float[Array, "*b k"]
-  """Log weights, not necessarily normalized."""
-
-  loc: Float[Array, "*b k d"]
-  """Means of the continuous part."""
-
-  scale_tril: Float[Array, "*b k d d"]
-  """Lower Cholesky factors of the covariances, with positive diagonals."""
-
-  gripper_logits: Float[Array, "*b k"]
-  """Log odds of gripper = 1."""
+  logits: Float[Array, "*b k"]  # log weights, not necessarily normalized
+  loc: Float[Array, "*b k d"]  # means of the continuous part
+  scale_tril: Float[Array, "*b k d d"]  # Cholesky factors with positive diagonals
+  gripper_logits: Float[Array, "*b k"]  # log odds of gripper = 1
 
   @property
   def event_shape(self) -> tuple[int, ...]:
@@ -89,11 +80,7 @@ class GripperGMM(ActionDistribution):
     return jax.nn.logsumexp(log_weights + gaussian + bernoulli, axis=-1)
 
   def entropy(self) -> Float[Array, "*b"]:
-    """Returns the entropy of a single component in nats.
-
-    Raises:
-      NotImplementedError: for several components; there is no closed form.
-    """
+    """Returns the entropy of one component in nats; several have no closed form."""
     if self.logits.shape[-1] > 1:
       raise NotImplementedError("entropy of several components; see entropy_bound")
     return self.component_entropy()[..., 0]
@@ -111,8 +98,7 @@ class GripperGMM(ActionDistribution):
     H >= sum_i w_i H_i - sum_i w_i log sum_j w_j BC_ij (Kolchinsky and Tracey 2017,
     "Estimating Mixture Entropy with Pairwise Distances"), where the Bhattacharyya
     coefficient BC_ij of two components is the product of the Gaussian and the
-    Bernoulli one. The bound is exact for one component, for equal components and for
-    well separated ones.
+    Bernoulli one. The bound is exact for one, for equal and for distant components.
     """
     log_weights = jnp.asarray(self.choice.logits)
     log_overlap = log_weights[..., None, :] + _log_bhattacharyya(self)
@@ -143,8 +129,7 @@ def _log_bhattacharyya(gmm: GripperGMM) -> Float[Array, "*b k k"]:
 
 def _half_log_det(scale_tril: Float[Array, "*b d d"]) -> Float[Array, "*b"]:
   """Returns half the log determinant of L L^T."""
-  diagonal = jnp.diagonal(scale_tril, axis1=-2, axis2=-1)
-  return jnp.sum(jnp.log(diagonal), axis=-1)
+  return jnp.sum(jnp.log(jnp.diagonal(scale_tril, axis1=-2, axis2=-1)), axis=-1)
 
 
 def _invert_lower(lower: Float[Array, "*b d d"]) -> Float[Array, "*b d d"]:
@@ -166,10 +151,7 @@ _MatrixVector = tuple[Float[Array, "*b d d"], Float[Array, "*b d"]]
 def _log_overlap(
   matrix: Float[Array, "*b d d"], difference: Float[Array, "*b d"]
 ) -> Float[Array, "*b"]:
-  """Returns -log(det M) / 2 - x^T M^-1 x / 8 for positive definite M.
-
-  The gradient is written out because it needs only the inverse.
-  """
+  """Returns -log(det M) / 2 - x^T M^-1 x / 8; the gradient needs only the inverse."""
   return _log_overlap_forward(matrix, difference)[0]
 
 
@@ -199,8 +181,7 @@ def _invert(
 ) -> tuple[Float[Array, "*b d d"], Float[Array, "*b"]]:
   """Returns the inverse and the log determinant of positive definite matrices.
 
-  Sweeps rows and columns in order (Gauss-Jordan without pivoting, which positive
-  definite matrices do not need). The determinant is the product of the pivots.
+  Sweeps rows and columns in order: Gauss-Jordan, which needs no pivoting here.
   """
   log_det = jnp.zeros(matrix.shape[:-2], matrix.dtype)
   for k in range(matrix.shape[-1]):

@@ -21,11 +21,7 @@ Renderer = Callable[[Kinematics], Array]
 
 
 def make_cameras(config: EnvConfig, scene: Scene) -> tuple[Renderer, Renderer]:
-  """Returns the cameras of the agent: the global one and the one on the wrist.
-
-  Raises:
-    ConfigError: the scene cannot be drawn.
-  """
+  """Returns the agent's global and wrist camera, or raises ``ConfigError``."""
   return (
     camera_renderer(config, scene, "global", config.global_size),
     camera_renderer(config, scene, "wrist", config.wrist_size),
@@ -44,17 +40,10 @@ def camera_renderer(
   lighting = Lighting.from_model(scene.model, **shadows)
 
   def renderer(kinematics: Kinematics) -> Array:
-    return render(
-      geoms,
-      spec,
-      kinematics.geom_xpos,
-      kinematics.geom_xmat,
-      kinematics.cam_xpos[..., index, :],
-      kinematics.cam_xmat[..., index, :, :],
-      lighting,
-      fields=kinematics.fields,
-      outputs=("rgb",),
-    ).rgb
+    camera = kinematics.cam_xpos[..., index, :], kinematics.cam_xmat[..., index, :, :]
+    poses = kinematics.geom_xpos, kinematics.geom_xmat, *camera
+    fields = kinematics.fields
+    return render(geoms, spec, *poses, lighting, fields=fields, outputs=("rgb",)).rgb
 
   return renderer
 
@@ -76,7 +65,5 @@ def shadows_of_the_hand(scene: Scene, geoms: Geoms) -> dict[str, Any]:
     np.where(kind == shapes.mjGEOM_PLANE, 0.0, np.inf),
   )
   receives = still & (2 * half_height < FLAT)
-  return {
-    "shadow_casters": tuple(geoms.ids[casts].tolist()),
-    "shadow_receivers": tuple(geoms.ids[receives].tolist()),
-  }
+  casters, receivers = (tuple(geoms.ids[x].tolist()) for x in (casts, receives))
+  return {"shadow_casters": casters, "shadow_receivers": receivers}

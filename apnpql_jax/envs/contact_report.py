@@ -23,22 +23,12 @@ def contact_report(
 ) -> dict[str, float]:
   """Measures a task's scene on this machine, with the arm at rest.
 
-  Args:
-    task: the task.
-    backends: engines to time.
-
-  Returns:
-    ``pairs``; ``contacts`` and ``constraint_rows``, the slots that MJX computes at
-    every substep whether anything touches or not; ``native_steps_per_s`` and
-    ``mjx_steps_per_s``, physics steps summed over worlds.
+  ``contacts`` and ``constraint_rows`` are the slots that MJX computes at every substep,
+  whether anything touches or not; steps per second are summed over worlds.
   """
-  scene = task.scene
-  slots = mjx.make_data(scene.model, impl="jax")._impl
-  report = {
-    "pairs": scene.model.npair,
-    "contacts": slots.ncon,
-    "constraint_rows": int(slots.nefc),
-  }
+  scene, model = task.scene, task.scene.model
+  slots = mjx.make_data(model, impl="jax")._impl
+  report = dict(pairs=model.npair, contacts=slots.ncon, constraint_rows=int(slots.nefc))
   draw = task.sample_resets(np.random.default_rng(0), WORLDS)
   start = physics.initial_state(scene, *map(jnp.asarray, draw))
   still, close = jnp.zeros((WORLDS, 6)), jnp.zeros(WORLDS)

@@ -56,20 +56,11 @@ class Env:
     *,
     instants: int = 0,
   ):
-    """Builds the engine, the cameras and the randomization.
-
-    Args:
-      config: sizes, limits, engine and kind of observation.
-      task: the task.
-      bank: reset states of the task.
-      mesh: devices to split the worlds between; one device if None.
-      instants: L, the length of ``EnvState.recent``; 0 for none.
-    """
+    """Builds the engine and the cameras; ``instants`` is L of ``EnvState.recent``."""
     scene = task.scene
     self.config, self.task, self.mesh = config, task, mesh
-    self.physics = engines.make_physics(
-      config.backend, scene, substeps=_substeps(config, scene)
-    )
+    substeps = _substeps(config, scene)
+    self.physics = engines.make_physics(config.backend, scene, substeps=substeps)
     self._bank, self._instants = bank, instants
     self._chain = arm.make_chain(scene)
     self._kinematics = make_kinematics(scene)
@@ -132,10 +123,7 @@ class Env:
   ) -> Arrival:
     """Runs the physics of one control period: first half of ``step``.
 
-    Args:
-      state: the worlds.
-      action: see ``types.ACTION_DIM``.
-      key: draws the bank rows of worlds that are reset.
+    ``action`` is as in ``types.ACTION_DIM``; ``key`` draws the bank rows of resets.
     """
     physics_step = devices.per_device(self.physics.step, self.mesh)
     moved = physics_step(state.physics, action[:, :6], action[:, 6])
@@ -188,25 +176,17 @@ class Env:
   def _initial(self, rows: Array, keys: Array) -> PhysicsState:
     """Returns worlds at rest at rows of the bank, randomized if configured."""
     bank = self._bank
-    state = physics.initial_state(
-      self.task.scene,
-      bank.qpos[rows],
-      bank.mocap_pos[rows],
-      bank.mocap_quat[rows],
-      bank.variant[rows],
-    )
+    drawn = bank.qpos, bank.mocap_pos, bank.mocap_quat, bank.variant
+    state = physics.initial_state(self.task.scene, *(x[rows] for x in drawn))
     return state if self._randomize is None else self._randomize(state, keys)
 
   def _sound(
     self, before: EnvState, action: Array, moved: PhysicsState
   ) -> Bool[Array, " worlds"]:
-    """Checks that all values are finite and that the engine has not reset the world.
-
-    C MuJoCo silently puts a world that is not finite back to its default pose; its
-    clock then shows less than before.
-    """
+    """Checks that all values are finite and that the engine has not reset the world."""
     leaves = jax.tree.leaves((before.physics, before.targets, action, moved))
     finite = [jnp.isfinite(x).all(tuple(range(1, x.ndim))) for x in leaves]
+    # C MuJoCo silently resets a world that is not finite, and its clock with it.
     return jnp.stack(finite).all(0) & (moved.time > before.physics.time)
 
   def _judge_and_observe(self, arrival: Arrival) -> EnvState:
@@ -254,10 +234,7 @@ class Env:
 def make_env(config: EnvConfig, mesh: Mesh | None = None, *, instants: int = 0) -> Env:
   """Builds the worlds of ``config.task``, and its reset bank on first use.
 
-  Args:
-    config: see ``Env``.
-    mesh: see ``Env``.
-    instants: see ``Env``; ``agent.lstm_instants`` of the agent that acts in it.
+  ``instants`` is ``agent.lstm_instants`` of the agent that acts in it.
 
   Raises:
     ConfigError: unknown task or engine, a scene that cannot be simulated or drawn, a

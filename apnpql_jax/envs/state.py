@@ -18,14 +18,12 @@ class EnvState(struct.PyTreeNode):
   elapsed: Int[Array, " worlds"]  # control periods since the reset
   timestep: TimeStep
   faults: Int[Array, " worlds"]  # resets because a value was not finite
-  recent: Observation | None = None  # [worlds, L, ...], for agents with an LSTM
+  # [worlds, L, ...], for agents with an LSTM; short episodes repeat their first.
+  recent: Observation | None = None
 
   @property
   def observation(self) -> Observation:
-    """The agent's input: the present observation, or the last L of the episode.
-
-    They are ordered oldest first; a shorter episode repeats its first observation.
-    """
+    """The agent's input: the present observation, or the last L, oldest first."""
     return self.timestep.observation if self.recent is None else self.recent
 
 
@@ -48,14 +46,7 @@ class Arrival(struct.PyTreeNode):
     targets: Float[Array, "worlds 3 6"],
     fresh: Bool[Array, " worlds"],
   ) -> Arrival:
-    """Returns the instant that follows ``before``.
-
-    Args:
-      before: the worlds one control period earlier.
-      physics: the worlds now.
-      targets: joint targets of the episodes that begin, rad.
-      fresh: where an episode begins.
-    """
+    """Returns the instant after ``before``; ``targets`` count where it is ``fresh``."""
     return cls(
       physics=physics,
       targets=where_world(fresh, targets, before.targets),

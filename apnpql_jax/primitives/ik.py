@@ -12,16 +12,12 @@ import numpy as np
 from apnpql_jax.config.files import mjcf_path
 
 MAX_ITERATIONS = 60
-POSITION_TOLERANCE = 1e-3
-"""m; a target with a larger residual counts as unreachable."""
-ROTATION_TOLERANCE = np.deg2rad(0.5)
-"""rad; likewise."""
-MAX_STEP = 0.3
-"""rad; longest step of a joint in one iteration."""
-
+POSITION_TOLERANCE = 1e-3  # m; a target with a larger residual counts as unreachable
+ROTATION_TOLERANCE = np.deg2rad(0.5)  # rad; likewise
+MAX_STEP = 0.3  # rad; longest step of a joint in one iteration
+# Against position and orientation costs of 1: it decides only the null space and, at
+# unreachable poses, keeps the arm near its start.
 POSTURE_COST = 1e-4
-"""Against position and orientation costs of 1: it decides only the null space and, at
-unreachable poses, keeps the arm near its start."""
 
 
 class IkSolver:
@@ -39,15 +35,9 @@ class IkSolver:
   def solve(
     self, start: np.ndarray, pos: np.ndarray, mat: np.ndarray
   ) -> tuple[np.ndarray, np.ndarray]:
-    """Finds the configuration nearest to ``start`` that puts the tool at a pose.
+    """Finds the configuration nearest to ``start`` that puts the tool at a world pose.
 
-    Args:
-      start: f64[6], rad; also the preferred posture.
-      pos: f64[3], tool position in the world frame, m.
-      mat: f64[3, 3], tool rotation in the world frame.
-
-    Returns:
-      f64[6] configuration (rad) and f64[2] residuals of the pose (m and rad).
+    Returns the configuration f64[6] (rad) and the residuals f64[2] (m and rad).
     """
     configuration = self._configuration
     q = np.zeros(configuration.model.nq)
@@ -65,13 +55,9 @@ class IkSolver:
       if residuals[0] < 1e-5 and residuals[1] < 1e-4:
         break
       # A unit step with a unit time constant: one Gauss-Newton step per iteration.
+      tasks = [self._pose, self._posture]
       velocity = mink.solve_ik(
-        configuration,
-        [self._pose, self._posture],
-        1.0,
-        solver="daqp",
-        damping=1e-9,
-        limits=self._limits,
+        configuration, tasks, 1.0, solver="daqp", damping=1e-9, limits=self._limits
       )
       # Longer steps could reach another branch of the arm's configurations.
       longest = max(float(np.abs(velocity).max()), 1e-9)
@@ -82,15 +68,9 @@ class IkSolver:
 def solve_all(
   starts: np.ndarray, positions: np.ndarray, rotations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-  """Solves the targets of many states in this process.
+  """Solves k targets for each of n states in this process.
 
-  Args:
-    starts: f64[n, 6], rad.
-    positions: f64[n, k, 3], m.
-    rotations: f64[n, k, 3, 3].
-
-  Returns:
-    f64[n, k, 6] targets (rad) and f64[n, k, 2] residuals (m and rad).
+  Returns targets f64[n, k, 6] (rad) and residuals f64[n, k, 2] (m and rad).
   """
   solver = IkSolver()
   solved = [

@@ -1,7 +1,6 @@
 """Reset states with the joint targets of their primitives, built once per task.
 
-Inside jit a reset only gathers a random row, so random resets cost nothing on any
-backend.
+Inside jit a reset only gathers a random row, so random resets cost nothing.
 """
 
 from __future__ import annotations
@@ -37,21 +36,14 @@ from apnpql_jax.sim.scene import free_joints
 from apnpql_jax.tasks.task import Task
 from apnpql_jax.types import Array
 
-VERSION = 3
-"""Part of the cache key; increased when the meaning of a bank changes."""
+VERSION = 3  # part of the cache key; increased when the meaning of a bank changes
 SEED = 0
 CHUNK = 32
-MAX_DRAWS = 20
-"""Draws per row before the task is rejected for lack of usable resets."""
-SETTLE_PERIODS = 4
-"""Control periods of 0.15 s at rest before a draw is accepted."""
-SETTLE_SPEED = 0.05
-"""m/s and rad/s; above float32 contact noise (0.04)."""
-SETTLE_SHIFT = 0.005
-"""m; an object that moves further while it settles overlapped with another."""
-MAX_TRAVEL = 2.5
-"""rad; a joint that turns further would pass through another branch of the arm's
-configurations."""
+MAX_DRAWS = 20  # per row before the task is rejected for lack of usable resets
+SETTLE_PERIODS = 4  # control periods of 0.15 s at rest before a draw is accepted
+SETTLE_SPEED = 0.05  # m/s and rad/s; above float32 contact noise (0.04)
+SETTLE_SHIFT = 0.005  # m; an object that settles further away overlapped with another
+MAX_TRAVEL = 2.5  # rad; turning further, a joint would pass through another branch
 
 
 class ResetBank(struct.PyTreeNode):

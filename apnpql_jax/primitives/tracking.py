@@ -9,35 +9,26 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from apnpql_jax.sim import arm
 from apnpql_jax.sim.physics import MAX_VELOCITY
 from apnpql_jax.types import Array
 
-GAIN = 2.0
-"""1/s, close to the target."""
+GAIN = 2.0  # 1/s, close to the target
+# rad/s^2, far from the target: v = sqrt(2 a d) stops within d. Below the limit of 1.2
+# because a command is held for 0.15 s. Without this profile a gain of 2.0 overshoots
+# by 0.06 rad from full speed; the largest gain that does not is 1.7.
 BRAKING = 0.7
-"""rad/s^2, far from the target: v = sqrt(2 a d) stops within d. Below the limit of 1.2
-because a command is held for 0.15 s. Without this profile a gain of 2.0 overshoots
-by 0.06 rad from full speed; the largest gain that does not is 1.7."""
-DAMPING = 1e-3
-"""m or rad; small compared to the Jacobian's singular values in the workspace."""
-REFINE_STEPS = 4
-"""Newton steps per control period; two reduce a jump of 10 cm to below 1 mm."""
-MAX_REFINEMENT = 0.3
-"""rad; longest joint step of one iteration, a trust region near singularities."""
+DAMPING = 1e-3  # m or rad; far below the Jacobian's singular values in the workspace
+REFINE_STEPS = 4  # per control period; two reduce a jump of 10 cm to below 1 mm
+MAX_REFINEMENT = 0.3  # rad; longest joint step, a trust region near singularities
 
 
-def follow(target: Array, q: Array) -> Array:
-  """Returns the velocity towards a target; all joints are scaled by the same factor.
-
-  Args:
-    target: f32[*b, 6], joint angles, rad.
-    q: f32[*b, 6], present joint angles, rad.
-
-  Returns:
-    f32[*b, 6], rad/s.
-  """
+def follow(
+  target: Float[Array, "*b 6"], q: Float[Array, "*b 6"]
+) -> Float[Array, "*b 6"]:
+  """Returns velocities (rad/s) towards joint angles; one factor scales all joints."""
   error = target - q
   farthest = jnp.abs(error).max(-1, keepdims=True)
   speed = jnp.minimum(GAIN * farthest, jnp.sqrt(2 * BRAKING * farthest))
@@ -46,23 +37,17 @@ def follow(target: Array, q: Array) -> Array:
 
 
 def refine(
-  chain: arm.ArmChain, last: Array, present: Array, pos: Array, mat: Array
-) -> Array:
-  """Moves joint targets towards tool poses by damped least squares.
+  chain: arm.ArmChain,
+  last: Float[Array, "*b 6"],
+  present: Float[Array, "*b 6"],
+  pos: Float[Array, "*b 3"],
+  mat: Float[Array, "*b 3 3"],
+) -> Float[Array, "*b 6"]:
+  """Moves joint targets (rad) towards tool poses by damped least squares.
 
   Starts from the last target, or from the present configuration if that is nearer to
   the pose. After a jump of the pose, as when an object has been grasped, steps from a
   distant start could end in another branch of the arm's configurations.
-
-  Args:
-    chain: the arm.
-    last: f32[*b, 6], rad.
-    present: f32[*b, 6], rad.
-    pos: f32[*b, 3], desired tool position, m.
-    mat: f32[*b, 3, 3], desired tool rotation.
-
-  Returns:
-    f32[*b, 6], rad.
   """
   damping = DAMPING**2 * jnp.eye(6)
 

@@ -17,10 +17,7 @@ from apnpql_jax.types import Array
 
 @dataclasses.dataclass(frozen=True)
 class Draw:
-  """Random numbers of one world.
-
-  Each setting has its own stream, so that turning one off leaves the others unchanged.
-  """
+  """Random numbers of one world, from a separate stream for each setting."""
 
   key: Array
   config: RandomizationConfig
@@ -48,7 +45,6 @@ class World(dict[str, Array]):
     self.model = model
 
   def __missing__(self, name: str) -> Array:
-    """Returns a field of the model or the color of the background, f32[...]."""
     source = Lighting() if name == "background" else self.model
     return jnp.asarray(getattr(source, name), jnp.float32)
 

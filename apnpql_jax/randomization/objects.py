@@ -11,11 +11,7 @@ from apnpql_jax.types import Array
 
 
 def scale(draw: Draw, world: World, qpos: Array) -> Array:
-  """Scales objects about their frames, with a separate factor along z.
-
-  Returns:
-    qpos f32[nq] with the objects raised or lowered to stand on the table again.
-  """
+  """Scales objects, separately along z; returns qpos with them back on the table."""
   if not (draw.config.size or draw.config.shape):
     return qpos
   model, objects = world.model, np.flatnonzero(free_bodies(world.model))
@@ -60,10 +56,8 @@ def _size_factors(model: mujoco.MjModel, axes: Array) -> Array:
   kinds = mujoco.mjtGeom
   radius = axes[:, :2].mean(axis=-1)
   round_ = jnp.stack([radius, axes[:, 2], axes[:, 2]], axis=-1)
-  is_round = np.isin(
-    model.geom_type, [kinds.mjGEOM_SPHERE, kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER]
-  )
-  return jnp.where(is_round[:, None], round_, axes)
+  rounds = kinds.mjGEOM_SPHERE, kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER
+  return jnp.where(np.isin(model.geom_type, rounds)[:, None], round_, axes)
 
 
 def weigh(draw: Draw, world: World) -> None:
@@ -80,19 +74,15 @@ def weigh(draw: Draw, world: World) -> None:
 
 
 def derive(world: World) -> None:
-  """Recomputes MuJoCo's constants that depend on mass, inertia and center of objects.
-
-  A free joint moves along three axes, then turns about three. The axes of inertia are
-  those of the body.
-  """
+  """Recomputes MuJoCo's constants that depend on objects' mass, inertia and center."""
+  # A free joint moves along three axes, then turns about those of inertia.
   model = world.model
   objects = np.flatnonzero(free_bodies(model))
   dof = model.body_dofadr[objects][:, None] + np.arange(6)
   mass = world["body_mass"][objects, None]
   inertia, square = world["body_inertia"][objects], world["body_ipos"][objects] ** 2
   lever = square.sum(axis=-1, keepdims=True) - square  # Squared, about each axis.
-  along = jnp.repeat(mass, 3, axis=-1)
-  weight = jnp.concatenate([along, inertia + mass * lever], axis=-1)
+  weight = jnp.concatenate([jnp.repeat(mass, 3, -1), inertia + mass * lever], -1)
   moves = 1.0 / mass + (lever / inertia).mean(axis=-1, keepdims=True)
   turns = (1.0 / inertia).mean(axis=-1, keepdims=True)
   inverse = jnp.repeat(jnp.concatenate([moves, turns], axis=-1), 3, axis=-1)

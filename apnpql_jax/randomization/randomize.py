@@ -1,11 +1,9 @@
 """Draws a separate world for every episode.
 
 The values go into ``PhysicsState.fields``, which both engines, the kinematics and the
-cameras read. They therefore cost no recompilation, and videos show them. Constants that
-MuJoCo derives from masses and sizes are recomputed (``objects``).
-
-The table stays in place and the robot stands lower or higher, tilted or turned on it,
-so that tasks can measure from the table.
+cameras read. They therefore cost no recompilation, and videos show them. The table
+stays in place and the robot stands lower or higher, tilted or turned on it, so that
+tasks can measure from the table.
 """
 
 from __future__ import annotations
@@ -24,9 +22,7 @@ from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
 
 WRIST_SHARE = 0.1  # shift of the wrist camera, as a share of that of the global camera
-
-Randomize = Callable[[PhysicsState, Array], PhysicsState]
-"""(states at rest [worlds, ...], keys [worlds]) -> the same states in drawn worlds."""
+Randomize = Callable[[PhysicsState, Array], PhysicsState]  # of states at rest and keys
 
 
 def make_randomize(config: RandomizationConfig, scene: Scene) -> Randomize:

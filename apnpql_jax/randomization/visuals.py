@@ -54,20 +54,17 @@ def texture(draw: Draw, world: World) -> None:
   rgb = jnp.concatenate([world["geom_rgba"][:, :3], world["background"][None]])
   other = (rgb + change[groups]).clip(0.0, 1.0)
   world["odd_rgb"] = jnp.where((kind == 1)[groups][:, None], other, rgb)
-  grain = jnp.where(kind == 2, 2.0 * jnp.abs(change[:, 0]), 0.0)
-  world["grain"] = grain[groups]
+  world["grain"] = jnp.where(kind == 2, 2.0 * jnp.abs(change[:, 0]), 0.0)[groups]
 
 
 def light(draw: Draw, world: World) -> None:
   """Changes the direction and the brightness of the light."""
   if draw.config.light_turn:
-    shape = world["light_dir"].shape
-    world["light_dir"] += draw.uniform("light_turn", shape)
+    world["light_dir"] += draw.uniform("light_turn", world["light_dir"].shape)
   if draw.config.light_level:
     plain, ones = Lighting(), jnp.ones_like(world["light_ambient"])
-    ambient, diffuse = draw.factor("light_level", (2,)) * jnp.asarray(
-      [plain.ambient, plain.diffuse], jnp.float32
-    )
+    factor = draw.factor("light_level", (2,))
+    ambient, diffuse = factor * jnp.asarray([plain.ambient, plain.diffuse], jnp.float32)
     # Keep the sum within one, where colors would be clipped.
     most = jnp.maximum(1.0, ambient + diffuse)
     world["light_ambient"] = ambient / most * ones

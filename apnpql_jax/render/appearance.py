@@ -17,6 +17,8 @@ from apnpql_jax.render.shadow import light_basis
 from apnpql_jax.render.texture import Texture
 from apnpql_jax.types import Array
 
+# What may differ between worlds, by MuJoCo's names and ids. The last of ngeom + 1 rows
+# is the background.
 FIELDS = (
   "geom_size",  # f32[*b, ngeom, 3]: MuJoCo half sizes, m
   "geom_rgba",  # f32[*b, ngeom, 4]: alpha is ignored
@@ -29,8 +31,6 @@ FIELDS = (
   "cam_fovy",  # f32[*b, ncam]: vertical field of view, degrees
   "background",  # f32[*b, 3]: color of rays that hit nothing
 )
-"""What may differ between worlds, by MuJoCo's names and ids; of ngeom + 1 rows the last
-is the background."""
 
 
 class Appearance(NamedTuple):
@@ -48,14 +48,7 @@ class Appearance(NamedTuple):
 def make_appearance(
   geoms: Geoms, camera: CameraSpec, lighting: Lighting, fields: Mapping[str, Array]
 ) -> Appearance:
-  """Builds the appearance of one world.
-
-  Args:
-    geoms: geoms to draw.
-    camera: camera that the field of view belongs to.
-    lighting: light and background.
-    fields: some of ``FIELDS``, without leading axes.
-  """
+  """Builds the appearance of one world from ``FIELDS`` without leading axes."""
 
   def pick(name: str, index: Any, default: Any) -> Any:
     return fields[name][index] if name in fields else default

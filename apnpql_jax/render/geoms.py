@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Sequence
 import dataclasses
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,10 +19,7 @@ from apnpql_jax.render.intersect import HITS
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Geoms:
-  """The n visible geoms of a model, ordered by type and then by MuJoCo id.
-
-  Hashed by identity, so that it can be a static argument.
-  """
+  """The n visible geoms of a model by type and MuJoCo id; hashed by identity."""
 
   ids: np.ndarray  # i32[n]: MuJoCo geom ids
   types: np.ndarray  # i32[n]: ``mujoco.mjtGeom``, sorted
@@ -34,19 +32,14 @@ class Geoms:
   def from_model(
     cls, model: mujoco.MjModel, groups: Sequence[int] = (0, 1, 2)
   ) -> Geoms:
-    """Reads the visible geoms: alpha above zero and group in ``groups``.
-
-    Args:
-      model: compiled MuJoCo model.
-      groups: geom groups to draw; the default is that of MuJoCo's viewer.
+    """Reads the visible geoms: alpha above zero; default groups as in MuJoCo's viewer.
 
     Raises:
       ConfigError: a visible geom has a type without closed-form intersection, or a
         texture other than a checker on a plane.
     """
     rgba = _effective_rgba(model)
-    visible = (rgba[:, 3] > 0) & np.isin(model.geom_group, groups)
-    ids = np.flatnonzero(visible)
+    ids = np.flatnonzero((rgba[:, 3] > 0) & np.isin(model.geom_group, groups))
     ids = ids[np.argsort(model.geom_type[ids], kind="stable")]
     colors, odd_colors = rgba[ids, :3].copy(), np.zeros((len(ids), 3))
     checker = np.zeros(len(ids))
@@ -64,14 +57,9 @@ class Geoms:
     )
 
   def rows(self, ids: Sequence[int], types: Container[int]) -> list[int]:
-    """Returns the rows of geoms, given by MuJoCo id, that take part in shadows.
-
-    Raises:
-      ValueError: a geom is not drawn or its type is not one of ``types``.
-    """
+    """Returns the rows of geoms, given by MuJoCo id, that take part in shadows."""
     rows = {int(i): k for k, i in enumerate(self.ids) if int(self.types[k]) in types}
-    wrong = [i for i in ids if i not in rows]
-    if wrong:
+    if wrong := [i for i in ids if i not in rows]:
       raise ValueError(
         f"geoms {wrong} cannot take part in shadows; valid: {sorted(rows)}"
       )
@@ -95,8 +83,7 @@ class CameraSpec:
     """Reads a camera by name.
 
     Raises:
-      ConfigError: the model has no such camera, it is not a plain perspective
-        camera, or the image would be empty.
+      ConfigError: the camera is missing or not plain perspective, or the image empty.
     """
     names = [model.camera(i).name for i in range(model.ncam)]
     if name not in names:
@@ -115,30 +102,20 @@ class Lighting:
   """Ambient light, one directional light, background and shadows.
 
   Intensity on a surface with unit normal n, where l points towards the light, is
-  ``ambient + diffuse * max(n.l, -fill * n.l)``.
+  ``ambient + diffuse * max(n.l, -fill * n.l)``; without ``fill`` all surfaces that face
+  away would have one flat color. Seen from the light, every shadow receiver must lie
+  behind every caster, as a table lies under a gripper. No casters, no cost.
   """
 
-  direction: tuple[float, float, float] = (0.3, 0.4, -1.0)
-  """World direction in which the light travels; need not be a unit vector."""
-  ambient: float = 0.35
-  """Intensity without the light."""
-  diffuse: float = 0.65
-  """Intensity added at normal incidence."""
-  fill: float = 0.3
-  """Share of ``diffuse`` on surfaces that face straight away from the light; without
-  it they would all have one flat color."""
-  background: tuple[float, float, float] = (0.55, 0.65, 0.75)
-  """Color of rays that hit nothing, in [0, 1]."""
-  shadow_casters: tuple[int, ...] = ()
-  """MuJoCo ids of the spheres, capsules and boxes that cast hard shadows. Empty
-  means no shadows and no cost."""
-  shadow_receivers: tuple[int, ...] = ()
-  """MuJoCo ids of the geoms on which shadows fall. Seen from the light, every
-  receiver must lie behind every caster, as a table lies under a gripper."""
-  shadow: float = 0.4
-  """Share of the intensity that a shadow removes."""
-  id: int = 0
-  """MuJoCo id of the light, for fields that differ between worlds."""
+  direction: tuple[float, float, float] = (0.3, 0.4, -1.0)  # of travel, of any length
+  ambient: float = 0.35  # intensity without the light
+  diffuse: float = 0.65  # intensity added at normal incidence
+  fill: float = 0.3  # share of ``diffuse`` on surfaces that face straight away
+  background: tuple[float, float, float] = (0.55, 0.65, 0.75)  # color without a hit
+  shadow_casters: tuple[int, ...] = ()  # MuJoCo ids of spheres, capsules and boxes
+  shadow_receivers: tuple[int, ...] = ()  # MuJoCo ids of drawn geoms
+  shadow: float = 0.4  # share of the intensity that a shadow removes
+  id: int = 0  # MuJoCo id of the light, for fields that differ between worlds
 
   def __post_init__(self):
     shares = (self.ambient, self.diffuse, self.fill, self.shadow, *self.background)
@@ -153,16 +130,11 @@ class Lighting:
       raise ValueError("a geom cannot both cast and receive shadows")
 
   @classmethod
-  def from_model(cls, model: mujoco.MjModel, **settings) -> Lighting:
-    """Takes the direction of the model's only directional light.
-
-    Args:
-      model: compiled MuJoCo model.
-      **settings: values of the other fields.
+  def from_model(cls, model: mujoco.MjModel, **settings: Any) -> Lighting:
+    """Takes the direction of the model's light; ``settings`` are other fields.
 
     Raises:
-      ConfigError: the model does not have exactly one directional light, or the
-        light is attached to a body.
+      ConfigError: there is not exactly one directional light, or a body carries it.
     """
     lights = np.flatnonzero(model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     if len(lights) != 1 or model.light_bodyid[lights[0]] != 0:
@@ -183,14 +155,7 @@ def _effective_rgba(model: mujoco.MjModel) -> np.ndarray:
 def _read_texture(
   model: mujoco.MjModel, geom_id: int
 ) -> tuple[float, np.ndarray, np.ndarray] | None:
-  """Reads a geom's checker.
-
-  Returns:
-    Edge (m) and colors of even and odd squares; None for a geom without a texture.
-
-  Raises:
-    ConfigError: the geom or its texture cannot be drawn.
-  """
+  """Reads a checker's edge (m), even and odd color; returns None without a texture."""
   kind, material = int(model.geom_type[geom_id]), model.geom_matid[geom_id]
   name = model.geom(geom_id).name or f"geom {geom_id}"
   if kind not in HITS:

@@ -15,14 +15,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 import mujoco
 import numpy as np
 
 from apnpql_jax.types import Array
 
-MISS = 1e30
-"""Depth of a ray that hits nothing; finite, so that no arithmetic turns it into NaN."""
-
+MISS = 1e30  # depth without a hit; finite, so that no arithmetic turns it into NaN
 TINY = 1e-12  # avoids division by zero
 _NUDGE = 1e-7  # turns rays off a cylinder's axis, where its equation is 0 / 0
 
@@ -31,24 +30,24 @@ class Rays(NamedTuple):
   """Directions (u, v, -1) of the P pixels of an image, in the camera's frame."""
 
   u: np.ndarray | Array  # f32[P]
-  v: np.ndarray | Array  # f32[P]
-  norm2: np.ndarray | Array  # f32[P]: squared length of the direction
-  inv_norm2: np.ndarray | Array  # f32[P]
+  v: np.ndarray | Array
+  norm2: np.ndarray | Array  # squared length of the direction
+  inv_norm2: np.ndarray | Array
 
 
 class Frames(NamedTuple):
   """Inputs of the intersections with n geoms; without the leading n for one geom."""
 
-  x: Array  # f32[n, 3]: axes of the geom in the camera's frame
-  y: Array  # f32[n, 3]
-  z: Array  # f32[n, 3]
-  center: Array  # f32[n, 3]: in the camera's frame, m
-  offset: Array  # f32[n, 3]: the same in the geom's own frame, m
-  light: Array  # f32[n, 3]: unit vector towards the light in the geom's own frame
-  center_light: Array  # f32[n]: inner product of center and light, m
-  center_norm2: Array  # f32[n]: squared distance of the center, m^2
-  size: Array  # f32[n, 3]: MuJoCo half sizes, m
-  inv_radius: Array  # f32[n]: 1 / size[0], for geoms where that is a radius
+  x: Float[Array, "n 3"]  # axes of the geom in the camera's frame
+  y: Float[Array, "n 3"]
+  z: Float[Array, "n 3"]
+  center: Float[Array, "n 3"]  # in the camera's frame, m
+  offset: Float[Array, "n 3"]  # the same in the geom's own frame, m
+  light: Float[Array, "n 3"]  # unit vector towards the light in the geom's own frame
+  center_light: Float[Array, " n"]  # inner product of center and light, m
+  center_norm2: Float[Array, " n"]  # squared distance of the center, m^2
+  size: Float[Array, "n 3"]  # MuJoCo half sizes, m
+  inv_radius: Float[Array, " n"]  # 1 / size[0], for geoms where that is a radius
 
 
 def make_rays(height: int, width: int, fovy_deg: float) -> Rays:
@@ -76,14 +75,7 @@ def along(w: Array, rays: Rays) -> Array:
 def prepare(
   center: Array, axes: Array, size: Array | np.ndarray, to_light: Array
 ) -> Frames:
-  """Computes the per-geom part of the intersections.
-
-  Args:
-    center: f32[n, 3], geom positions in the camera's frame.
-    axes: f32[n, 3, 3], their rotations; the columns are the geoms' axes.
-    size: f32[n, 3], MuJoCo half sizes.
-    to_light: f32[3], unit vector towards the light in the camera's frame.
-  """
+  """Computes the part per geom; vectors, and axes as columns, in the camera's frame."""
   # Sums, not einsum: XLA's CPU backend would call a library for each tiny product.
   return Frames(
     x=axes[:, :, 0],
@@ -155,9 +147,8 @@ def ellipsoid_hit(g: Frames, rays: Rays, ray_light: Array) -> tuple[Array, Array
 def _tube(g: Frames, rays: Rays) -> tuple[Array, Array, Array, Array, Array, Array]:
   """Intersects the infinite cylinder of radius size[0] along the geom's z.
 
-  Returns:
-    Entry, exit, whether it is hit, inner product of transverse direction and offset,
-    axial direction, and axial entry point measured from the center.
+  Returns entry, exit, whether it is hit, inner product of transverse direction and
+  offset, axial direction, and axial entry point measured from the center.
   """
   dx, dy, dz = along(g.x, rays) + _NUDGE, along(g.y, rays), along(g.z, rays)
   inv_a = 1.0 / (dx * dx + dy * dy)
@@ -222,9 +213,8 @@ def box_hit(g: Frames, rays: Rays, ray_light: Array) -> tuple[Array, Array]:
   return jnp.where(hit, t, MISS), cosine
 
 
-Hit = Callable[[Frames, Rays, Array], tuple[Array, Array]]
-
-HITS: dict[int, Hit] = {
+# Intersection by ``mujoco.mjtGeom``.
+HITS: dict[int, Callable[[Frames, Rays, Array], tuple[Array, Array]]] = {
   int(mujoco.mjtGeom.mjGEOM_PLANE): plane_hit,
   int(mujoco.mjtGeom.mjGEOM_SPHERE): sphere_hit,
   int(mujoco.mjtGeom.mjGEOM_CAPSULE): capsule_hit,
@@ -232,4 +222,3 @@ HITS: dict[int, Hit] = {
   int(mujoco.mjtGeom.mjGEOM_BOX): box_hit,
   int(mujoco.mjtGeom.mjGEOM_CYLINDER): cylinder_hit,
 }
-"""Intersection by ``mujoco.mjtGeom``."""

@@ -18,6 +18,7 @@ import functools
 from flax import struct
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float, Int, UInt8
 import numpy as np
 
 from apnpql_jax.render import intersect, shadow, texture
@@ -27,20 +28,17 @@ from apnpql_jax.types import Array
 
 OUTPUTS = ("rgb", "depth", "segmentation")
 DEFAULT_LIGHTING = Lighting()
-NEAR = 0.005
-"""Default near limit in meters."""
-BLOCKS = 4
-"""Blocks of pixels per image; with one there would be no loop."""
-
+NEAR = 0.005  # m
+BLOCKS = 4  # of pixels per image; with one there would be no loop
 _FULL = 255.0 / 256.0  # full intensity; below one, as the integer part is the color
 
 
 class Image(struct.PyTreeNode):
   """Image of a camera; outputs that were not requested are ``None``."""
 
-  rgb: Array | None = None  # u8[*b, H, W, 3]
-  depth: Array | None = None  # f32[*b, H, W]: m along the viewing axis; inf: no hit
-  segmentation: Array | None = None  # i32[*b, H, W]: MuJoCo geom ids; -1: no hit
+  rgb: UInt8[Array, "*b H W 3"] | None = None
+  depth: Float[Array, "*b H W"] | None = None  # m along the viewing axis; inf: no hit
+  segmentation: Int[Array, "*b H W"] | None = None  # MuJoCo geom ids; -1: no hit
 
 
 @functools.partial(
@@ -49,10 +47,10 @@ class Image(struct.PyTreeNode):
 def render(
   geoms: Geoms,
   camera: CameraSpec,
-  geom_xpos: Array,
-  geom_xmat: Array,
-  cam_xpos: Array,
-  cam_xmat: Array,
+  geom_xpos: Float[Array, "*b ngeom 3"],
+  geom_xmat: Float[Array, "*b ngeom 3 3"],
+  cam_xpos: Float[Array, "*b 3"],
+  cam_xmat: Float[Array, "*b 3 3"],
   lighting: Lighting = DEFAULT_LIGHTING,
   *,
   fields: Mapping[str, Array] | None = None,
@@ -62,22 +60,8 @@ def render(
   """Casts one ray per pixel through its center.
 
   Geoms are opaque. Back faces are not drawn, so a camera inside a geom sees through
-  it, as in MuJoCo's renderer. Geoms hit closer than ``near`` are not drawn either.
-
-  Args:
-    geoms: geoms to draw.
-    camera: image size and field of view.
-    geom_xpos: f32[*b, ngeom, 3], world positions by MuJoCo geom id.
-    geom_xmat: f32[*b, ngeom, 3, 3], world rotations by MuJoCo geom id.
-    cam_xpos: f32[*b, 3], world position of this camera.
-    cam_xmat: f32[*b, 3, 3], world rotation of this camera.
-    lighting: light, background, shadows.
-    fields: values per world of some ``appearance.FIELDS``; other names are ignored.
-    outputs: which of "rgb", "depth", "segmentation" to compute.
-    near: smallest depth drawn, in meters.
-
-  Returns:
-    The image, with the leading axes of the poses.
+  it, as in MuJoCo's renderer. Geoms hit closer than ``near`` (m) are not drawn either.
+  Poses are in the world; ``fields`` are values per world of some ``appearance.FIELDS``.
 
   Raises:
     ValueError: an output is unknown, the shapes do not match, a shadow caster is not
@@ -119,7 +103,6 @@ def _render_one(
   look = make_appearance(geoms, camera, lighting, fields)
   basis = (look.light[:, :, None] * to_camera).sum(axis=1)
   frames = intersect.prepare(center, axes, look.sizes, basis[2])
-
   blocks = _blocks(camera, look.zoom)
   cast = functools.partial(_cast, geoms, lighting, look, frames, basis, near)
   t = paint = None
@@ -164,9 +147,8 @@ def _make_image(
     index = jnp.floor(paint)
     entry = index.astype(jnp.int32)
     if "rgb" in outputs:
-      colors = palette * np.float32(256.0)
-      rgb = jnp.take(colors, entry, axis=0, mode="clip") * (paint - index)[:, None]
-      rgb = rgb.astype(jnp.uint8).reshape(*shape, 3)
+      rgb = jnp.take(palette * np.float32(256.0), entry, axis=0, mode="clip")
+      rgb = (rgb * (paint - index)[:, None]).astype(jnp.uint8).reshape(*shape, 3)
     if "segmentation" in outputs:
       ids = np.tile(np.append(geoms.ids, np.int32(-1)), 2)
       segmentation = jnp.take(ids, entry, mode="clip").reshape(shape)
@@ -182,11 +164,9 @@ def _cast(
   near: float,
   rays: intersect.Rays,
 ) -> tuple[Array, Array]:
-  """Finds the first hit of every ray.
+  """Finds depth and paint f32[P] of every ray's first hit; ``MISS`` without one.
 
-  Returns:
-    f32[P] depth, ``intersect.MISS`` if the ray hits nothing, and f32[P] paint, whose
-    integer part is the palette's index and whose fraction is the intensity.
+  The integer part of the paint is the palette's index, its fraction the intensity.
   """
   ray_light = intersect.along(basis[2], rays)
   t = jnp.full(rays.u.shape, intersect.MISS, jnp.float32)

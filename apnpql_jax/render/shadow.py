@@ -20,12 +20,7 @@ from apnpql_jax.types import Array
 
 
 def light_basis(direction: Any, xp: Any = np) -> Any:
-  """Returns f32[3, 3]: rows e1, e2 across the light and l towards it, in world axes.
-
-  Args:
-    direction: [3], in which the light travels.
-    xp: ``numpy`` or ``jax.numpy``.
-  """
+  """Returns f32[3, 3]: rows e1, e2 across the light and l towards it, in world axes."""
   toward = -xp.asarray(direction)
   toward = toward / xp.linalg.norm(toward)
   helper = xp.eye(3)[xp.argmin(xp.abs(toward))]
@@ -37,14 +32,7 @@ def light_basis(direction: Any, xp: Any = np) -> Any:
 def capsule_shadow(g: Frames, rays: Rays, t: Array, basis: Array) -> Array:
   """Returns whether a capsule, or a sphere with half length 0, darkens each point.
 
-  Args:
-    g: the caster.
-    rays: rays of the image.
-    t: f32[P], depth of the point on each ray.
-    basis: f32[3, 3], ``light_basis`` in the camera's frame.
-
-  Returns:
-    bool[P]: the line along the light meets the caster.
+  The points are at depth t on the rays; ``basis`` is in the camera's frame.
   """
   # Distance of the projected point from the projected axis.
   axis = [(g.z * basis[k]).sum() for k in range(2)]
@@ -67,9 +55,9 @@ def box_shadow(g: Frames, rays: Rays, t: Array, basis: Array) -> Array:
   return functools.reduce(jnp.maximum, enter) <= functools.reduce(jnp.minimum, leave)
 
 
+# Shadow test by ``mujoco.mjtGeom``.
 SHADOWS: dict[int, Callable[[Frames, Rays, Array, Array], Array]] = {
   int(mujoco.mjtGeom.mjGEOM_SPHERE): capsule_shadow,
   int(mujoco.mjtGeom.mjGEOM_CAPSULE): capsule_shadow,
   int(mujoco.mjtGeom.mjGEOM_BOX): box_shadow,
 }
-"""Shadow test by ``mujoco.mjtGeom``."""

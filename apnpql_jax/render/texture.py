@@ -36,19 +36,11 @@ def _odd(x: Array) -> Array:
 def apply_texture(
   frames: Frames, texture: Texture, cam_xmat: Array, rays: Rays, t: Array, paint: Array
 ) -> Array:
-  """Returns the paint f32[P] with the texture at the visible points.
+  """Returns the paint f32[P], see ``raycast``, with the texture at the depths t.
 
   Textures are evaluated once per pixel, for the visible point. Evaluated at each
   intersection they took sixteen times as long: XLA did not compile the fold over the
   geoms into one loop.
-
-  Args:
-    frames: of the geoms, [n - 1, ...].
-    texture: of geoms and background, [n, ...].
-    cam_xmat: f32[3, 3], world rotation of the camera.
-    rays: rays of the image.
-    t: f32[P], depth of the visible point on each ray, or ``MISS``.
-    paint: f32[P], see ``raycast``.
   """
   waves, grain = texture
   axes = jnp.stack([frames.x, frames.y, frames.z], axis=1)

@@ -12,17 +12,12 @@ import logging
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from apnpql_jax.config.files import config_diff, config_from_json, format_diff
+from apnpql_jax.config.files import config_from_json
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import FileError, UserError, one_line
 from apnpql_jax.runs import checkpoint_record, leaves
-from apnpql_jax.runs.checkpoint_record import (
-  DamagedError,
-  best,
-  newest_until,
-  title,
-)
-from apnpql_jax.runs.run_folder import MAY_CHANGE
+from apnpql_jax.runs.checkpoint_record import DamagedError, best, newest_until, title
+from apnpql_jax.runs.run_folder import fixed_diff
 
 all_steps = checkpoint_record.steps
 
@@ -31,14 +26,9 @@ class Restored(NamedTuple):
   """Result of ``restore``."""
 
   step: int
-  items: dict[str, Any]
-  """Item -> pytree, as requested."""
-
-  steps: dict[str, int]
-  """Item -> step of the checkpoint that holds it: ``step`` or an earlier one."""
-
-  damaged: list[str]
-  """One line for each newer checkpoint that could not be used."""
+  items: dict[str, Any]  # item -> pytree, as requested
+  steps: dict[str, int]  # item -> step of the checkpoint it is from, at most ``step``
+  damaged: list[str]  # a line for each newer checkpoint that could not be used
 
 
 def latest_step(run_dir: Path) -> int | None:
@@ -55,35 +45,6 @@ def best_step(run_dir: Path) -> int | None:
   return best({step: record.success_rate for step, record in records.items()})
 
 
-def check(run_dir: Path, step: int | None, *, config: TrainConfig | None = None) -> int:
-  """Rejects checkpoints that cannot be restored, before anything else is built.
-
-  Args:
-    run_dir: the run folder.
-    step: the checkpoint; None selects the newest one with a readable record.
-    config: as in ``restore``.
-
-  Returns:
-    The step.
-
-  Raises:
-    FileError: there is no such checkpoint, or it belongs to another configuration
-      or format.
-  """
-  steps = _candidates(run_dir, step)
-  damaged: list[str] = []
-  for candidate in steps:
-    try:
-      record = checkpoint_record.read(run_dir, candidate)
-    except DamagedError as error:
-      damaged.append(str(error))
-      continue
-    if config is not None:
-      _check_config(title(run_dir, candidate), record.config, config)
-    return candidate
-  raise DamagedError("; ".join(damaged))
-
-
 def restore(
   run_dir: Path,
   step: int | None,
@@ -94,24 +55,27 @@ def restore(
   """Restores items of a checkpoint with the exact bits that were saved.
 
   An item that the checkpoint lacks comes from the newest earlier one that holds it.
+  Without ``examples``, only rejects checkpoints that cannot be restored, which needs
+  nothing but their records.
 
   Args:
-    run_dir: the run folder.
-    step: the checkpoint, without fallback; None selects the newest readable one.
-    examples: item -> a pytree of the same structure, with arrays or
-      ShapeDtypeStructs. The latter, as from ``jax.eval_shape``, save the memory of a
-      second state.
-    config: if given, the configuration that the checkpoint must have, except for
-      settings that a resumed run may change.
+    run_dir: The run folder.
+    step: The checkpoint, without fallback; None selects the newest readable one.
+    examples: Item -> pytree of the same structure, of arrays or, to save the memory of
+      a second state, ShapeDtypeStructs.
+    config: The configuration that the checkpoint must have, except for settings that a
+      resumed run may change; not checked if None.
 
   Raises:
-    FileError: there is no such checkpoint, it belongs to another configuration or
+    FileError: There is no such checkpoint, it belongs to another configuration or
       format, its leaves differ from the example, or its files cannot be read.
   """
   damaged: list[str] = []
   for candidate in _candidates(run_dir, step):
     try:
-      check(run_dir, candidate, config=config)
+      record = checkpoint_record.read(run_dir, candidate)
+      if config is not None:
+        _check_config(title(run_dir, candidate), record.config, config)
       steps = {name: _step_with(run_dir, candidate, name) for name in examples}
       items = {
         name: _restore_item(run_dir, steps[name], name, example)
@@ -138,12 +102,11 @@ def _candidates(run_dir: Path, step: int | None) -> list[int]:
 
 def _check_config(name: str, saved: Any, wanted: TrainConfig) -> None:
   try:
-    diff = config_diff(config_from_json(json.dumps(saved)), wanted)
+    diff = fixed_diff(config_from_json(json.dumps(saved)), wanted)
   except UserError as error:
     raise FileError(f"{name}: {error}") from None
-  diff = {field: pair for field, pair in diff.items() if field not in MAY_CHANGE}
   if diff:
-    raise FileError(f"{name} belongs to other settings: {format_diff(diff)}")
+    raise FileError(f"{name} belongs to other settings: {diff}")
 
 
 def _step_with(run_dir: Path, last: int, item: str) -> int:
@@ -160,18 +123,25 @@ def _restore_item(run_dir: Path, step: int, item: str, example: Any) -> Any:
 
   name = title(run_dir, step)
   saved = checkpoint_record.read(run_dir, step).items[item]
-  checkpoint_record.check_kinds(name, saved, example)
+  wanted = {path: leaves.kind(leaf) for path, leaf in leaves.named(example).items()}
+  for path in sorted(saved.keys() | wanted.keys()):
+    held = saved[path].kind if path in saved else "nothing"
+    expected = wanted.get(path, "nothing")
+    if held != expected:
+      raise FileError(f"{name} holds {held} at {path}, where {expected} is expected")
   try:
     with ocp.StandardCheckpointer() as reader:
-      path = checkpoint_record.folder(run_dir) / str(step) / item
-      tree = reader.restore(path, leaves.abstract(example))
+      folder = checkpoint_record.folder(run_dir) / str(step) / item
+      tree = reader.restore(folder, leaves.abstract(example))
   except (MemoryError, PermissionError):
     raise  # Not caused by the checkpoint.
   except Exception as error:  # Any error of Orbax or the file system.
     # Orbax's abandoned tasks would log pages of tracebacks.
     logging.getLogger("asyncio").setLevel(logging.CRITICAL)
     raise DamagedError(f"{name} cannot be read: {one_line(error)}") from error
-  checkpoint_record.check_bits(name, saved, tree)
+  for path, crc32 in leaves.checksums(tree).items():
+    if crc32 != saved[path].crc32:
+      raise DamagedError(f"{name} is damaged: {path} is not what was saved")
   impls = {path: leaf.key_impl for path, leaf in saved.items() if leaf.key_impl}
   try:
     return leaves.to_typed(tree, impls, example)

@@ -24,6 +24,10 @@ SCHEMA_VERSION = 2
 _MAX_BYTES = 16 << 20
 """Limit for the file of a record, which takes a few hundred bytes per leaf."""
 
+_MALFORMED = (OSError, ValueError, RecursionError, LookupError, TypeError)
+_MALFORMED += (AttributeError,)
+"""Exceptions raised for malformed records."""
+
 
 class DamagedError(FileError):
   """A checkpoint that differs from what was written; an older one may be intact."""
@@ -32,14 +36,9 @@ class DamagedError(FileError):
 class Leaf(NamedTuple):
   """One array of a checkpoint."""
 
-  kind: str
-  """dtype and shape, such as ``uint8[4, 72, 96, 3]``."""
-
-  key_impl: str | None
-  """Name of the generator if the leaf is a typed PRNG key."""
-
-  crc32: int
-  """Checksum of the bytes."""
+  kind: str  # dtype and shape, see ``leaves.kind``
+  key_impl: str | None  # generator of a typed PRNG key, see ``leaves.key_impl``
+  crc32: int  # of the bytes
 
 
 class Record(NamedTuple):
@@ -47,8 +46,7 @@ class Record(NamedTuple):
 
   config: dict[str, Any]
   success_rate: float | None
-  items: dict[str, dict[str, Leaf]]
-  """Item -> path -> leaf; a checkpoint may lack items that older ones hold."""
+  items: dict[str, dict[str, Leaf]]  # item -> path -> leaf; some items may be absent
 
 
 def describe(
@@ -91,15 +89,8 @@ def read(run_dir: Path, step: int) -> Record:
     return Record(record["config"], None if rate is None else float(rate), items)
   except UserError:
     raise
-  except (
-    OSError,
-    ValueError,
-    RecursionError,
-    LookupError,
-    TypeError,
-    AttributeError,
-  ) as e:
-    raise DamagedError(f"{name} cannot be read: {one_line(e)}") from None
+  except _MALFORMED as error:
+    raise DamagedError(f"{name} cannot be read: {one_line(error)}") from None
 
 
 def read_all(run_dir: Path) -> dict[int, Record]:
@@ -141,36 +132,11 @@ def newest_until(last: int, steps: Iterable[int]) -> int | None:
   return max((step for step in steps if step <= last), default=None)
 
 
-def check_kinds(name: str, saved: Mapping[str, Leaf], example: Any) -> None:
-  """Rejects leaves whose name, dtype or shape differs from those of ``example``.
-
-  Raises:
-    FileError: names the first leaf that differs.
-  """
-  wanted = leaves.describe(example)
-  for path in sorted(saved.keys() | wanted.keys()):
-    held = saved[path].kind if path in saved else "nothing"
-    expected = wanted.get(path, "nothing")
-    if held != expected:
-      raise FileError(f"{name} holds {held} at {path}, where {expected} is expected")
-
-
-def check_bits(name: str, saved: Mapping[str, Leaf], tree: Any) -> None:
-  """Compares the leaves that were read with the saved checksums.
-
-  Raises:
-    DamagedError: names the first leaf that differs.
-  """
-  for path, crc32 in leaves.checksums(tree).items():
-    if crc32 != saved[path].crc32:
-      raise DamagedError(f"{name} is damaged: {path} is not what was saved")
-
-
 def _describe_leaves(tree: Any) -> dict[str, Leaf]:
-  impls, crc32s = leaves.key_impls(tree), leaves.checksums(tree)
+  crc32s = leaves.checksums(tree)
   return {
-    path: Leaf(kind, impls.get(path), crc32s[path])
-    for path, kind in leaves.describe(tree).items()
+    path: Leaf(leaves.kind(leaf), leaves.key_impl(leaf), crc32s[path])
+    for path, leaf in leaves.named(tree).items()
   }
 
 

@@ -6,7 +6,7 @@ saved less often than the rest.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 import shutil
 import time
@@ -33,13 +33,10 @@ class CheckpointWriter:
   """
 
   def __init__(self, run_dir: Path, config: TrainConfig, *, keep: int):
-    """Opens the run for writing.
+    """Opens the run for writing; ``config`` is stored with every checkpoint.
 
-    Args:
-      run_dir: the run folder.
-      config: stored with every checkpoint.
-      keep: number of newest checkpoints to keep, in addition to the older ones that
-        hold items they lack and the one with the highest success rate.
+    Keeps the ``keep`` newest checkpoints, the older ones that hold items they lack, and
+    the one with the highest success rate.
     """
     import orbax.checkpoint as ocp
 
@@ -77,6 +74,7 @@ class CheckpointWriter:
     Raises:
       SaveError: this save cannot be started, or the previous one failed.
     """
+    import jax
     import orbax.checkpoint as ocp
 
     self.wait()
@@ -84,9 +82,13 @@ class CheckpointWriter:
       return False
     self._saving = step, time.monotonic()
     record = checkpoint_record.describe(self._config, items, success_rate)
-    parts = {name: _save_args(leaves.to_plain(tree)) for name, tree in items.items()}
-    parts["meta"] = ocp.args.JsonSave(record)
-    self._policy.add(step, success_rate, items)
+    parts: dict[str, Any] = {"meta": ocp.args.JsonSave(record)}
+    chunked = ocp.SaveArgs(chunk_byte_size=_CHUNK_BYTES)
+    for name, tree in items.items():
+      plain = leaves.to_plain(tree)
+      args = jax.tree.map(lambda _: chunked, plain)
+      parts[name] = ocp.args.StandardSave(plain, save_args=args)
+    self._policy.rates[step], self._policy.items[step] = success_rate, set(items)
     try:
       return self._manager.save(step, args=ocp.args.Composite(**parts), force=True)
     except Exception as error:
@@ -95,8 +97,7 @@ class CheckpointWriter:
   def finished(self, *, wait: bool = False) -> dict[str, float]:
     """Returns seconds and MiB of a save that ended since the last call, or nothing.
 
-    Args:
-      wait: whether to wait for a save in progress.
+    With ``wait``, waits for a save in progress.
 
     Raises:
       SaveError: the save failed.
@@ -144,7 +145,10 @@ class CheckpointWriter:
     self._saving = None
     for part in checkpoint_record.folder(self._run_dir).glob(f"{step}.*-tmp*"):
       shutil.rmtree(part, ignore_errors=True)
-    return SaveError(f"checkpoint {step} could not be saved: {_cause(error)}")
+    cause = one_line(error)
+    if "os_error_code" in str(error):  # Leave out the names of temporary files.
+      cause = " ".join(str(error).split()).rpartition(": ")[2]
+    return SaveError(f"checkpoint {step} could not be saved: {cause}")
 
 
 class _KeepNewestAndBest:
@@ -155,34 +159,16 @@ class _KeepNewestAndBest:
   """
 
   def __init__(self, run_dir: Path, keep: int):
+    records = checkpoint_record.read_all(run_dir)
     self._keep = keep
-    self._rates: dict[int, float | None] = {}
-    self._items: dict[int, set[str]] = {}
-    for step, record in checkpoint_record.read_all(run_dir).items():
-      self.add(step, record.success_rate, record.items)
-
-  def add(self, step: int, success_rate: float | None, items: Iterable[str]) -> None:
-    self._rates[step], self._items[step] = success_rate, set(items)
+    self.rates = {step: record.success_rate for step, record in records.items()}
+    self.items = {step: set(record.items) for step, record in records.items()}
 
   def should_preserve(self, checkpoints: Sequence[Any], **_: Any) -> list[bool]:
     steps = sorted(info.step for info in checkpoints)
     newest = steps[-self._keep :]
-    kept = {*newest, best({step: self._rates.get(step) for step in steps})}
-    for name in set().union(*self._items.values()):
-      holding = [step for step in steps if name in self._items.get(step, ())]
+    kept = {*newest, best({step: self.rates.get(step) for step in steps})}
+    for name in set().union(*self.items.values()):
+      holding = [step for step in steps if name in self.items.get(step, ())]
       kept |= {newest_until(step, holding) for step in newest}
     return [info.step in kept for info in checkpoints]
-
-
-def _save_args(plain: Any) -> Any:
-  import jax
-  import orbax.checkpoint as ocp
-
-  chunked = jax.tree.map(lambda _: ocp.SaveArgs(chunk_byte_size=_CHUNK_BYTES), plain)
-  return ocp.args.StandardSave(plain, save_args=chunked)
-
-
-def _cause(error: Exception) -> str:
-  """Returns the file system's message without the names of temporary files."""
-  text = " ".join(str(error).split())
-  return text.rpartition(": ")[2] if "os_error_code" in text else one_line(error)

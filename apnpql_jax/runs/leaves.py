@@ -44,18 +44,14 @@ def nbytes(tree: Any) -> int:
   return sum(map(size, jax.tree.leaves(tree)))
 
 
-def describe(tree: Any) -> dict[str, str]:
-  """Returns path -> dtype and shape, such as ``uint8[4, 72, 96, 3]``, of each leaf."""
-  return {path: f"{leaf.dtype}{list(leaf.shape)}" for path, leaf in named(tree).items()}
+def kind(leaf: Any) -> str:
+  """Returns dtype and shape of a leaf, such as ``uint8[4, 72, 96, 3]``."""
+  return f"{leaf.dtype}{list(leaf.shape)}"
 
 
-def key_impls(tree: Any) -> dict[str, str]:
-  """Returns path -> name of the generator of each typed PRNG key."""
-  return {
-    path: str(jax.random.key_impl(leaf))
-    for path, leaf in named(tree).items()
-    if _is_key(leaf)
-  }
+def key_impl(leaf: Any) -> str | None:
+  """Returns the name of the generator of a typed PRNG key; None for other leaves."""
+  return str(jax.random.key_impl(leaf)) if _is_key(leaf) else None
 
 
 def checksums(tree: Any) -> dict[str, int]:
@@ -94,7 +90,7 @@ def to_plain(tree: Any) -> Any:
 
 
 def to_typed(tree: Any, impls: Mapping[str, str], example: Any) -> Any:
-  """Undoes ``to_plain``, given the ``key_impls`` and shapes of the original tree.
+  """Undoes ``to_plain``, given the generators (path -> name) and the original shapes.
 
   Raises:
     ValueError: the generators do not fit the keys.

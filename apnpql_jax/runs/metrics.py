@@ -12,12 +12,8 @@ from typing import Any, Protocol
 from apnpql_jax.errors import FileError
 from apnpql_jax.runs.text import write_text
 
-STEP = "step"
-"""Environment steps, summed over worlds; every row has it."""
-
-WALL = "time/wall_s"
-"""Seconds of training, including those before a resume."""
-
+STEP = "step"  # environment steps, summed over worlds; in every row
+WALL = "time/wall_s"  # seconds of training, including those before a resume
 SUCCESS = "eval/success_rate"
 EPISODES = "eval/episodes"
 
@@ -32,10 +28,7 @@ def wilson_interval(successes: int, n: int) -> tuple[float, float]:
 
   Unlike the normal approximation, it stays within [0, 1] and does not shrink to a point
   at 0 or ``n`` successes.
-
-  Args:
-    successes: between 0 and ``n``.
-    n: independent episodes; 0 gives (0, 1).
+  Zero episodes give (0, 1).
 
   Raises:
     ValueError: ``successes`` is not within [0, n].
@@ -53,11 +46,9 @@ class Sink(Protocol):
 
   def write(self, step: int, row: Mapping[str, float]) -> None:
     """Receives the metrics of one step."""
-    ...
 
   def close(self) -> None:
     """Flushes what is still buffered."""
-    ...
 
 
 class MetricWriter:
@@ -75,17 +66,12 @@ class MetricWriter:
     clock: Callable[[], float] = time.monotonic,
     max_bytes: int = MAX_BYTES,
   ):
-    """Opens the file and keeps its rows.
+    """Opens the file and keeps its rows, except those after ``resume_step``.
 
-    Args:
-      run_dir: an existing run folder.
-      resume_step: drops the rows of later steps; the run repeats those steps.
-      sinks: additional destinations; closed together with this writer.
-      clock: returns seconds; only differences matter.
-      max_bytes: size of ``metrics.jsonl`` above which a new file begins.
+    The sinks are closed together with this writer.
 
     Raises:
-      FileError: a row cannot be read.
+      FileError: A row cannot be read.
     """
     self._path = run_dir / "metrics.jsonl"
     self._sinks, self._clock, self._max_bytes = tuple(sinks), clock, max_bytes
@@ -95,12 +81,9 @@ class MetricWriter:
     self._start = clock() - ((rows[-1].get(WALL) or 0.0) if rows else 0.0)
 
   def write(self, step: int, metrics: Mapping[str, Any]) -> None:
-    """Adds one row.
+    """Adds a row of numbers or arrays of one element.
 
-    Args:
-      step: environment steps done.
-      metrics: name -> number or array of one element. Values that are not finite
-        become null in the file.
+    Values that are not finite become null in the file.
     """
     numbers = {name: _number(value) for name, value in metrics.items()}
     row: Row = {STEP: step, WALL: round(self._clock() - self._start, 3), **numbers}
@@ -159,13 +142,11 @@ def _numbered(path: Path, number: int) -> Path:
 def read_rows(path: Path, *, having: str = "") -> list[Row]:
   """Returns the rows of a metric file, oldest first; none if there is no file.
 
-  Args:
-    path: the file.
-    having: skips lines without this text, so that the few evaluations of a long run
-      are read without parsing all of its rows.
+  Skips lines without the text ``having``, so that the few evaluations of a long run are
+  read without parsing all of its rows.
 
   Raises:
-    FileError: a line other than an incomplete last one is not a row.
+    FileError: A line other than an incomplete last one is not a row.
   """
   if not path.exists():
     return []
@@ -200,22 +181,21 @@ def plot_curve(rows: Sequence[Row], path: Path, *, title: str = "") -> bool:
   from matplotlib.backends.backend_agg import FigureCanvasAgg
   from matplotlib.figure import Figure
 
-  rates = [row[SUCCESS] or 0.0 for row in rows]
+  percent = [100 * (row[SUCCESS] or 0.0) for row in rows]
   low, high = zip(*map(_interval, rows), strict=True)
+  band = [[100 * bound for bound in bounds] for bounds in (low, high)]
   figure = Figure(figsize=(9.0, 3.6), layout="constrained")
   FigureCanvasAgg(figure)
   axes = figure.subplots(1, 2, sharey=True)
   steps = [row[STEP] or 0.0 for row in rows]
   minutes = [(row.get(WALL) or 0.0) / 60 for row in rows]
-  for axis, x, label in zip(
-    axes, (steps, minutes), ("environment steps", "wall-clock minutes"), strict=True
-  ):
-    axis.plot(x, [100 * rate for rate in rates], marker=".", color="C0")
-    band = [[100 * bound for bound in bounds] for bounds in (low, high)]
+  axes[0].set(xlabel="environment steps", ylabel="success of held-out episodes, %")
+  axes[1].set(xlabel="wall-clock minutes")
+  for axis, x in zip(axes, (steps, minutes), strict=True):
+    axis.plot(x, percent, marker=".", color="C0")
     axis.fill_between(x, *band, alpha=0.25, color="C0", linewidth=0)
-    axis.set(xlabel=label, ylim=(-2, 102))
+    axis.set(ylim=(-2, 102))
     axis.grid(alpha=0.3)
-  axes[0].set_ylabel("success of held-out episodes, %")
   figure.suptitle(title)
   part = path.with_name(path.name + ".part")
   figure.savefig(part, dpi=120, format="png")
@@ -236,8 +216,7 @@ def _number(value: Any) -> float:
 
 
 def _json_line(row: Row) -> str:
-  plain = {
-    name: value if value is None or math.isfinite(value) else None
-    for name, value in row.items()
+  finite = {
+    k: x if x is not None and math.isfinite(x) else None for k, x in row.items()
   }
-  return json.dumps(plain, allow_nan=False) + "\n"
+  return json.dumps(finite, allow_nan=False) + "\n"

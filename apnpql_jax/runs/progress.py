@@ -28,30 +28,21 @@ class TrainProgress:
   ):
     """Builds the display without showing it.
 
-    Args:
-      total_steps: environment steps of the whole run.
-      stream: destination; standard error if None.
-      period_s: seconds between two plain lines.
-      clock: returns seconds; only differences matter.
+    Without a terminal, a line is printed every ``period_s`` seconds. ``stream`` is
+    standard error if None.
     """
-    from rich.console import Console
-    from rich.progress import (
-      BarColumn,
-      Progress,
-      TaskProgressColumn,
-      TextColumn,
-      TimeRemainingColumn,
-    )
+    from rich import console, progress
 
     stream = stream or sys.stderr
     self._period, self._clock = period_s, clock
-    self._time_left = TimeRemainingColumn()
-    self._bar = Progress(
-      BarColumn(bar_width=24),
-      TaskProgressColumn(),
-      TextColumn("{task.completed:,} steps  {task.fields[figures]}", markup=False),
+    text = "{task.completed:,} steps  {task.fields[figures]}"
+    self._time_left = progress.TimeRemainingColumn()
+    self._bar = progress.Progress(
+      progress.BarColumn(bar_width=24),
+      progress.TaskProgressColumn(),
+      progress.TextColumn(text, markup=False),
       self._time_left,
-      console=Console(file=stream),
+      console=console.Console(file=stream),
       speed_estimate_period=_SPEED_PERIOD_S,
       get_time=clock,
       disable=not stream.isatty(),
@@ -75,12 +66,9 @@ class TrainProgress:
   def update(
     self, step: int, *, updates: int, success_rate: float | None = None
   ) -> None:
-    """Shows how far the run is.
+    """Shows environment steps and updates done, including those before a resume.
 
-    Args:
-      step: environment steps done, including those before a resume.
-      updates: learner updates done.
-      success_rate: newest success rate in [0, 1]; None keeps the previous one.
+    A ``success_rate`` (in [0, 1]) of None keeps the previous one.
     """
     if success_rate is not None:
       self._success = success_rate

@@ -1,7 +1,7 @@
 """SIGINT and SIGTERM of a run: when to finish and save, and when to end at once.
 
-Python runs signal handlers between two of its instructions, and a compilation or a
-save is minutes of one: a thread therefore watches for what has to end at once.
+Python runs signal handlers between two instructions, and a compilation or a save is one
+that takes minutes. A thread therefore watches for signals that end the process at once.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ from typing import Any
 from apnpql_jax.errors import INTERRUPTED
 
 _ONE_REQUEST_S = 1.0
-"""Signals this close are one request: `timeout` and batch systems send it twice."""
+"""Signals closer than this are one: `timeout` and batch systems send it twice."""
 
 
 class Signals:
   """Collects signals while it is entered; only the main thread may enter it.
 
-  A signal ends the process at once, with one line and exit code ``INTERRUPTED`` plus
-  its number, if nothing is to be saved yet or if it is the second.
+  A signal ends the process at once, with a line and exit code ``INTERRUPTED`` plus its
+  number, unless ``finish_first`` was called and it is the first.
   """
 
-  def __init__(self, words: str):
-    """Nothing is to be saved yet; ``words`` say how to go on in that case."""
+  def __init__(self, message: str):
+    """Sets the line that is printed when a signal ends the process."""
     self.caught: list[int] = []
-    self._words, self._patient = words, False
+    self._message, self._patient = message, False
 
-  def finish_first(self, words: str) -> None:
-    """From now on the first signal is only collected; ``words`` are for the second."""
-    self._words, self._patient = words, True
+  def finish_first(self, message: str) -> None:
+    """Only collects the first signal from now on; the second prints ``message``."""
+    self._message, self._patient = message, True
 
   def __enter__(self) -> Signals:
     self._woken, self._wake = os.pipe()
-    os.set_blocking(self._wake, False)  # As the interpreter wants it.
+    os.set_blocking(self._wake, False)  # Required by the interpreter.
     self._wake_before = signal.set_wakeup_fd(self._wake)
     self._before: dict[int, Any] = {
       number: signal.signal(number, lambda number, _: self.caught.append(number))
@@ -55,7 +55,7 @@ class Signals:
     os.close(self._wake)
 
   def _watch(self) -> None:
-    """Reads what the interpreter writes as soon as a signal comes: its number."""
+    """Reads the numbers of signals, which the interpreter writes as they arrive."""
     first = None
     while byte := os.read(self._woken, 1):
       if byte[0] not in self._before:
@@ -70,14 +70,14 @@ class Signals:
 
   def _end(self, number: int) -> None:
     for child in multiprocessing.active_children():
-      child.kill()  # They would wait for work for ever.
+      child.kill()  # They would wait for work forever.
     if sys.stderr.isatty():
       os.write(2, b"\x1b[?25h")  # The cursor, which a progress bar hides.
-    _write(f"apnpql: {self._words}")
+    _write(f"apnpql: {self._message}")
     os._exit(INTERRUPTED + number)
 
 
 def _write(line: str) -> None:
-  """Past Python's buffers, whose locks the main thread may hold."""
-  with contextlib.suppress(OSError):  # It may lie on a disk that is full.
+  """Bypasses Python's buffers, whose locks the main thread may hold."""
+  with contextlib.suppress(OSError):  # The disk may be full.
     os.write(2, (line + "\n").encode())

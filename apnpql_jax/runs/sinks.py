@@ -11,31 +11,27 @@ from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs.metrics import Sink
 
 
-class TensorboardSink:
-  """Sink to event files in ``tensorboard/`` of the run folder (extra ``tb``)."""
+class _TensorboardSink:
+  """Sink to event files in ``tensorboard/`` of the run folder."""
 
   def __init__(self, run_dir: Path, config: Mapping[str, Any]):
-    """Opens the event file; ``config`` is ignored."""
     del config
     from tensorboardX import SummaryWriter
 
     self._writer = SummaryWriter(logdir=str(run_dir / "tensorboard"))
 
   def write(self, step: int, row: Mapping[str, float]) -> None:
-    """Writes one scalar per metric."""
     for name, value in row.items():
       self._writer.add_scalar(name, value, step)
 
   def close(self) -> None:
-    """Flushes the event file."""
     self._writer.close()
 
 
-class WandbSink:
-  """Sink to a Weights & Biases run named after the folder (extra ``wandb``)."""
+class _WandbSink:
+  """Sink to a Weights & Biases run named after the run folder."""
 
   def __init__(self, run_dir: Path, config: Mapping[str, Any]):
-    """Starts the run with ``config`` as its settings."""
     import wandb
 
     self._run = wandb.init(
@@ -43,17 +39,15 @@ class WandbSink:
     )
 
   def write(self, step: int, row: Mapping[str, float]) -> None:
-    """Logs all metrics of a step at once."""
     self._run.log(dict(row), step=step)
 
   def close(self) -> None:
-    """Finishes the run and waits for the upload."""
     self._run.finish()
 
 
 _SINKS = {
-  "tensorboard": (TensorboardSink, "tensorboardX", "tb"),
-  "wandb": (WandbSink, "wandb", "wandb"),
+  "tensorboard": (_TensorboardSink, "tensorboardX", "tb"),
+  "wandb": (_WandbSink, "wandb", "wandb"),
 }
 """Name -> class, the package it needs, the extra that installs it."""
 
@@ -77,11 +71,5 @@ def check_sinks(names: Sequence[str]) -> None:
 def make_sinks(
   names: Sequence[str], run_dir: Path, config: Mapping[str, Any]
 ) -> list[Sink]:
-  """Opens the named sinks.
-
-  Args:
-    names: any of ``tensorboard`` and ``wandb``.
-    run_dir: an existing run folder.
-    config: plain data shown with the curves.
-  """
+  """Opens the named sinks; ``config`` is plain data shown with the curves."""
   return [_SINKS[name][0](run_dir, config) for name in names]

@@ -1,4 +1,4 @@
-"""Small text files, read within a limit and written whole or not at all."""
+"""Small text files, read within a limit and written atomically."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from pathlib import Path
 
 
 def read_text(path: Path, limit: int) -> str:
-  """The text of a file that other people may have made.
+  """Returns the text of an untrusted file.
 
   Raises:
-    ValueError: it has more than ``limit`` bytes, or is not UTF-8.
+    ValueError: It has more than ``limit`` bytes, or is not UTF-8.
   """
   with path.open("rb") as file:
     data = file.read(limit + 1)
@@ -20,7 +20,7 @@ def read_text(path: Path, limit: int) -> str:
 
 
 def write_text(path: Path, text: str) -> None:
-  """Writes a file whole or not at all, so that a killed run leaves no half of one."""
+  """Writes a file atomically, so that a killed run leaves no half of one."""
   part = path.with_name(path.name + ".part")
   part.write_text(text, encoding="utf-8")
   os.replace(part, path)

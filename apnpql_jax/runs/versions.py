@@ -1,4 +1,4 @@
-"""The record of what a run was made with: versions, commit and devices."""
+"""Record of the versions, commit and devices that a run was started with."""
 
 from __future__ import annotations
 
@@ -16,28 +16,31 @@ _PACKAGES = (
 ).split()
 
 
-def changed_versions(path: Path, *, devices: int = 1) -> list[str]:
-  """What differs between the record of a run and now, such as ``jax 0.9.1 -> 0.10.2``.
+def changed_versions(run_dir: Path, *, devices: int = 1) -> list[str]:
+  """Returns what changed since a run was started, such as ``jax 0.9.1 -> 0.10.2``.
 
-  A run resumed with other versions or another device learns on, but not bit by bit as
-  it would have; without a readable record, that is the one line.
+  With other versions or another device a resumed run keeps learning, but not bit for
+  bit. If the record cannot be read, the only line says so.
   """
+  from apnpql_jax.runs import leaves
+
   try:
-    old = _flat(json.loads(path.read_text(encoding="utf-8")))
+    record = (run_dir / "versions.json").read_text(encoding="utf-8")
+    old = leaves.named(json.loads(record))
   except (OSError, ValueError):
-    return [f"{path.name} cannot be read"]
-  new = _flat(describe_versions(devices))
+    return ["versions.json cannot be read"]
+  new = leaves.named(describe_versions(devices))
   names = sorted((old.keys() | new.keys()) - {"created"})
   return [
-    f"{name.rpartition('.')[2]} {old.get(name)} -> {new.get(name)}"
+    f"{name.rpartition('/')[2]} {old.get(name)} -> {new.get(name)}"
     for name in names
     if old.get(name) != new.get(name)
   ]
 
 
 def describe_versions(devices: int) -> dict[str, Any]:
-  """Versions of Python and the packages, git commit of a checkout, devices, time."""
-  import jax  # Here, so that naming a run folder does not start JAX.
+  """Returns versions of Python and packages, git commit of a checkout, devices."""
+  import jax  # Here, so that run folders can be named without JAX.
 
   return {
     "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -61,7 +64,7 @@ def _version(package: str) -> str | None:
 
 
 def _git(package_dir: Path) -> dict[str, Any] | None:
-  """Commit and whether tracked files differ from it; None outside of a checkout."""
+  """Returns commit and whether tracked files differ; None outside of a checkout."""
 
   def git(*args: str) -> str:
     command = ["git", "-C", str(package_dir), *args]
@@ -76,13 +79,3 @@ def _git(package_dir: Path) -> dict[str, Any] | None:
     return {"commit": git("rev-parse", "HEAD"), "dirty": bool(changes)}
   except (OSError, subprocess.SubprocessError):
     return None
-
-
-def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-  flat: dict[str, Any] = {}
-  for name, value in tree.items():
-    if isinstance(value, dict):
-      flat |= _flat(value, f"{prefix}{name}.")
-    else:
-      flat[prefix + name] = value
-  return flat

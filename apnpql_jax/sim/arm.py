@@ -1,9 +1,10 @@
-"""Kinematics of the arm in JAX: tool pose and geometric Jacobian."""
+"""Kinematics of the arm in JAX: tool pose and geometric Jacobian in the world."""
 
 from __future__ import annotations
 
 from flax import struct
 import jax.numpy as jnp
+from jaxtyping import Float
 import mujoco
 import numpy as np
 
@@ -14,13 +15,13 @@ from apnpql_jax.types import ARM_DOF, Array
 class ArmChain(struct.PyTreeNode):
   """The serial chain from the world to the tool site; lengths in m."""
 
-  base_pos: Array  # f32[*b, 3]: parent of the first link in the world
-  base_mat: Array  # f32[*b, 3, 3]
-  link_pos: Array  # f32[6, 3]: joint frame in its parent link at q = 0
-  link_mat: Array  # f32[6, 3, 3]
-  axis: Array  # f32[6, 3]: unit joint axes in the link frame
-  tool_pos: Array  # f32[3]: tool site in the last link
-  tool_mat: Array  # f32[3, 3]
+  base_pos: Float[Array, "*b 3"]  # parent of the first link in the world
+  base_mat: Float[Array, "*b 3 3"]
+  link_pos: Float[Array, "6 3"]  # joint frame in its parent link at q = 0
+  link_mat: Float[Array, "6 3 3"]
+  axis: Float[Array, "6 3"]  # unit joint axes in the link frame
+  tool_pos: Float[Array, " 3"]  # tool site in the last link
+  tool_mat: Float[Array, "3 3"]
 
 
 def make_chain(scene: Scene) -> ArmChain:
@@ -34,8 +35,7 @@ def make_chain(scene: Scene) -> ArmChain:
   link_mat = np.zeros((ARM_DOF, 9))
   for mat, body in zip(link_mat, bodies, strict=True):
     mujoco.mju_quat2Mat(mat, model.body_quat[body])
-  # The tool site may belong to a body fixed to the last link: take its pose relative
-  # to that link, at the reference pose.
+  # The tool site may belong to a body fixed to the last link.
   last_mat = data.xmat[last].reshape(3, 3)
   tool_mat = data.site_xmat[scene.tool_site].reshape(3, 3)
   arrays = {
@@ -51,12 +51,9 @@ def make_chain(scene: Scene) -> ArmChain:
 
 
 def with_base(chain: ArmChain, scene: Scene, fields: dict[str, Array]) -> ArmChain:
-  """Returns the chain with the base pose of each world, for q f32[worlds, n, 6].
+  """Returns the chain with each world's base pose, for joint angles [worlds, n, 6].
 
-  Args:
-    chain: the arm of the scene.
-    scene: the scene, which names the base.
-    fields: those of ``PhysicsState``, [worlds, ...]; a pose they lack is kept.
+  ``fields`` are those of ``PhysicsState``, [worlds, ...]; a pose they lack is kept.
   """
   base = scene.id("body", "base")
   if "body_pos" in fields:
@@ -66,17 +63,10 @@ def with_base(chain: ArmChain, scene: Scene, fields: dict[str, Array]) -> ArmCha
   return chain
 
 
-def forward(chain: ArmChain, q: Array) -> tuple[Array, Array, Array]:
-  """Computes tool pose and geometric Jacobian in the world frame.
-
-  Args:
-    chain: the arm.
-    q: f32[*b, 6], rad.
-
-  Returns:
-    position f32[*b, 3] in m, rotation f32[*b, 3, 3], and Jacobian f32[*b, 6, 6]
-    (rows: linear m/rad, angular rad/rad).
-  """
+def forward(
+  chain: ArmChain, q: Float[Array, "*b 6"]
+) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 3 3"], Float[Array, "*b 6 6"]]:
+  """Returns tool position (m), rotation, and Jacobian (rows: linear, then angular)."""
   batch = q.shape[:-1]
   pos = jnp.broadcast_to(chain.base_pos, (*batch, 3))
   mat = jnp.broadcast_to(chain.base_mat, (*batch, 3, 3))
@@ -96,8 +86,10 @@ def forward(chain: ArmChain, q: Array) -> tuple[Array, Array, Array]:
   return pos, mat, jnp.concatenate([linear, axis], axis=-2)
 
 
-def rotation_error(current: Array, target: Array) -> Array:
-  """Returns the rotation vector f32[*b, 3] (rad, world) from current to target."""
+def rotation_error(
+  current: Float[Array, "*b 3 3"], target: Float[Array, "*b 3 3"]
+) -> Float[Array, "*b 3"]:
+  """Returns the rotation vector (rad, world) from current to target."""
   delta = target @ jnp.swapaxes(current, -1, -2)
   # The skew part of a rotation is sin(angle) * axis, its trace 1 + 2 cos(angle).
   pairs = (2, 1), (0, 2), (1, 0)
@@ -107,21 +99,23 @@ def rotation_error(current: Array, target: Array) -> Array:
   return skew * jnp.arctan2(sine, cosine) / sine
 
 
-def _axis_rotation(axis: Array, angle: Array) -> Array:
-  """Returns f32[*b, 3, 3] by Rodrigues' formula."""
+def _axis_rotation(
+  axis: Float[Array, " 3"], angle: Float[Array, "*b"]
+) -> Float[Array, "*b 3 3"]:
+  """Returns the rotation by Rodrigues' formula."""
   skew = _skew(axis)
   sine, cosine = jnp.sin(angle)[..., None, None], jnp.cos(angle)[..., None, None]
   return jnp.eye(3) + sine * skew + (1 - cosine) * (skew @ skew)
 
 
-def _rotation(quat: Array) -> Array:
-  """Returns the rotations f32[*b, 3, 3] of unit quaternions f32[*b, 4] (wxyz)."""
+def _rotation(quat: Float[Array, "*b 4"]) -> Float[Array, "*b 3 3"]:
+  """Returns the rotations of unit quaternions (wxyz)."""
   w, skew = quat[..., :1, None], _skew(quat[..., 1:])
   return jnp.eye(3) + 2 * (w * skew + skew @ skew)
 
 
-def _skew(v: Array) -> Array:
-  """Returns the matrices f32[*b, 3, 3] of the cross products with f32[*b, 3]."""
+def _skew(v: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
+  """Returns the matrices of the cross products with the vectors."""
   x, y, z = jnp.moveaxis(v, -1, 0)
   zero = jnp.zeros_like(x)
   return jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*v.shape, 3)

@@ -18,25 +18,18 @@ from typing import Any
 import jax
 import numpy as np
 
+# (read-only f32 arrays) -> f32 arrays; uses NumPy only, because JAX could deadlock.
 HostFunction = Callable[..., Sequence[np.ndarray]]
-"""(read-only f32 arrays) -> f32 arrays; uses NumPy only, because JAX could deadlock."""
-
-_MAJOR, _MINOR = 0, 1
-"""First version of the interface that has everything used here."""
-
+_MAJOR, _MINOR = 0, 1  # first version of the interface that has everything used here
 _F32, _EXECUTE, _METADATA, _INTERNAL = 11, 3, 1, 13
-
+# Function and callback given to XLA by name; both must outlive every program.
 _registered: dict[str, tuple[HostFunction, Any]] = {}
-"""Name -> function and the callback given to XLA; both must outlive every program."""
 
 
 def register(name: str, function: HostFunction) -> None:
   """Makes a function available to ``call``; a name keeps its first function.
 
-  Args:
-    name: identifies the function in every process: a program from the cache finds the
-      function by its name alone.
-    function: returns arrays of the shapes that ``call`` was given.
+  A program from the cache finds its function by the name alone, in every process.
   """
   if name in _registered:
     return
@@ -66,13 +59,7 @@ def register(name: str, function: HostFunction) -> None:
 
 
 def call(name: str, shapes: Sequence[Any], *arrays: Any) -> Sequence[Any]:
-  """Calls a registered function inside jit.
-
-  Args:
-    name: as given to ``register``.
-    shapes: ShapeDtypeStructs of the results.
-    arrays: f32 arguments of the function.
-  """
+  """Calls a function inside jit; ``shapes`` are ShapeDtypeStructs of its results."""
   if jax.default_backend() == "cpu":
     return jax.ffi.ffi_call(name, shapes)(*arrays)
   # On other devices the arrays have to be copied to the host first.
@@ -101,7 +88,6 @@ def _structure(name: str, **fields: Any) -> Any:
 
 
 _HEAD = {"size": c_size_t, "extension": c_void_p}
-
 _Version = _structure("Version", **_HEAD, major=c_int, minor=c_int)
 _Metadata = _structure("Metadata", size=c_size_t, version=_Version)
 _Extension = _structure(

@@ -41,7 +41,6 @@ def make_kinematics(scene: Scene) -> Callable[[PhysicsState], Kinematics]:
       qpos=state.qpos, mocap_pos=state.mocap_pos, mocap_quat=state.mocap_quat
     )
     data = mjx.camlight(world, mjx.kinematics(world, data))
-    poses = {name: getattr(data, name) for name in _POSES}
-    return Kinematics(**poses, fields=state.fields)
+    return Kinematics(**{k: getattr(data, k) for k in _POSES}, fields=state.fields)
 
   return jax.vmap(kinematics)

@@ -9,7 +9,7 @@ import numpy as np
 
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.mjx_patches import patch_mjx
-from apnpql_jax.sim.physics import PhysicsState
+from apnpql_jax.sim.physics import STATE_FIELDS, PhysicsState
 from apnpql_jax.sim.scene import Scene, free_joints
 from apnpql_jax.types import Array
 
@@ -40,8 +40,7 @@ class MjxPhysics:
   def _step_world(self, state, velocity, close):
     model = self._model.replace(**physics.model_fields(state.fields))
     speed = state.fields.get("gripper_speed", physics.GRIPPER_SPEED)
-    loaded = {name: getattr(state, name) for name in physics.STATE_FIELDS}
-    data = self._template.replace(**loaded)
+    data = self._template.replace(**{k: getattr(state, k) for k in STATE_FIELDS})
 
     def substep(carry, index):
       now, grip = velocity, close
@@ -64,30 +63,19 @@ class MjxPhysics:
     )
 
   def _substep(self, model, data, velocity, close, speed):
-    # mjx.step with the control between its velocity and actuation stages: mass matrix
-    # and bias are those of the present state and computed only once.
+    # mjx.step with the control after its velocity stage, whose mass and bias it uses.
     arm = self.scene.arm_dof
     data = mjx.fwd_velocity(model, mjx.fwd_position(model, data))
-    torque = physics.arm_torque(
-      mjx.full_m(model, data)[arm][:, arm],
-      data.qfrc_bias[arm],
-      data.qvel[arm],
-      velocity,
-      self._torque_limit,
-    )
-    finger = physics.gripper_torque(
-      data.qpos[self.scene.gripper_qpos],
-      data.qvel[self.scene.gripper_dof],
-      close,
-      jnp,
-      speed=speed,
-    )
+    mass, limit = mjx.full_m(model, data)[arm][:, arm], self._torque_limit
+    bias, qvel = data.qfrc_bias[arm], data.qvel[arm]
+    torque = physics.arm_torque(mass, bias, qvel, velocity, limit)
+    angle, rate = data.qpos[self.scene.gripper_qpos], data.qvel[self.scene.gripper_dof]
+    finger = physics.gripper_torque(angle, rate, close, jnp, speed=speed)
     data = data.replace(ctrl=jnp.append(torque, finger))
     data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
     data = mjx.solve(model, data)
-    # In float32 the solver can stop before forces and accelerations match. The
-    # integrator uses the forces, and the residual would throw light objects away:
-    # free bodies get the forces that belong to the accelerations.
+    # In float32 the solver can stop before forces match accelerations. The residual
+    # would throw light objects away: free bodies get the accelerations' forces.
     force = mjx.mul_m(model, data, data.qacc) - data.qfrc_smooth
     force = jnp.where(self._free, force, data.qfrc_constraint)
     return mjx.implicit(model, data.replace(qfrc_constraint=force))

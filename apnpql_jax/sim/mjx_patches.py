@@ -30,12 +30,10 @@ def patch_mjx() -> None:
 
 
 def _guarded_body_tree(m, f, in_types, out_types, *args, reverse=False):
-  def behind_barrier(*inputs):
+  def guarded(*inputs):
     return jax.lax.optimization_barrier(f(*inputs))
 
-  return _stock_body_tree(
-    m, behind_barrier, in_types, out_types, *args, reverse=reverse
-  )
+  return _stock_body_tree(m, guarded, in_types, out_types, *args, reverse=reverse)
 
 
 def _update_gradient(m, d, ctx):

@@ -22,15 +22,13 @@ from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
 
 _CONTROL = ("gripper_speed", "control_delay", "command")
-_VISUAL = ("cam_", "light_", "geom_rgba")
-"""Prefixes of model fields that do not affect physics."""
+_VISUAL = ("cam_", "light_", "geom_rgba")  # prefixes of fields without physics
 
 
 class NativePhysics:
   """Worlds advanced by ``mujoco.batch``; see ``physics.Physics``.
 
-  The batch object is scratch space: every call loads the whole state, so the
-  mapping from state to state is pure.
+  Every call loads the whole state into the batch, so a step is a pure function.
   """
 
   name = "native"
@@ -66,15 +64,7 @@ class NativePhysics:
     return mujoco_batch.Batch(self.scene.model, nsim=worlds, persistent=True)
 
   def _step_host(self, names: tuple[str, ...], *arrays: np.ndarray) -> list[np.ndarray]:
-    """Advances the worlds on the host.
-
-    Args:
-      names: what each array is, without the last two.
-      *arrays: [worlds, ...]; the last two are desired velocities and gripper commands.
-
-    Returns:
-      The new ``STATE_FIELDS``, f32[worlds, ...].
-    """
+    """Returns the new ``STATE_FIELDS``; ``arrays`` end with velocities and gripper."""
     *loaded, velocity, close = arrays
     command = np.concatenate([velocity, close[:, None]], axis=-1)
     with self._lock:
@@ -89,7 +79,7 @@ class NativePhysics:
       return [np.array(getattr(batch, name), np.float32) for name in STATE_FIELDS]
 
   def _advance(self, batch, command, control) -> None:
-    scene, arm = self.scene, self.scene.arm_dof
+    scene, arm, limit = self.scene, self.scene.arm_dof, self._torque_limit
     mass, bias = batch.bind("M"), batch.bind("qfrc_bias")
     qpos, qvel, ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
     stage = int(mujoco.mjtStage.mjSTAGE_VEL)
@@ -101,19 +91,10 @@ class NativePhysics:
         late = np.less(substep, control["control_delay"])
         now = np.where(late[:, None], control["command"], command)
       ctrl[:, :6] = physics.arm_torque(
-        mass[:, self._mass_index],
-        bias[:, arm],
-        qvel[:, arm],
-        now[:, :6],
-        self._torque_limit,
+        mass[:, self._mass_index], bias[:, arm], qvel[:, arm], now[:, :6], limit
       )
-      ctrl[:, 6] = physics.gripper_torque(
-        qpos[:, scene.gripper_qpos],
-        qvel[:, scene.gripper_dof],
-        now[:, 6],
-        np,
-        speed=speed,
-      )
+      angle, rate = qpos[:, scene.gripper_qpos], qvel[:, scene.gripper_dof]
+      ctrl[:, 6] = physics.gripper_torque(angle, rate, now[:, 6], np, speed=speed)
       batch.step(stage=stage)
 
 

@@ -16,26 +16,26 @@ import numpy as np
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
 
-MAX_VELOCITY = 1.0
-"""rad/s; the paper's "m/s" can only mean joint space."""
-MAX_ACCELERATION = 1.2
-"""rad/s^2 (paper Sec. V-A)."""
-VELOCITY_GAIN = 25.0
-"""1/s; brings a joint to the desired velocity well within one 0.15 s period."""
-GRIPPER_SPEED = 0.075
-"""m/s of pad gap: the closing speed in the manufacturer's manual."""
-GRIPPER_GAIN = 10.0
-"""N m s/rad, half of what is stable for the coupled fingers at 5 ms steps."""
-GRIPPER_TORQUE = 3.5
-"""N m, as in the manufacturer's model: 30-60 N per pad."""
-FINGER_LENGTH = 0.057
-"""m; with FINGER_ANGLE the closed form gap(q) = 2 (4.1 mm + L cos(q + 30 deg))."""
+MAX_VELOCITY = 1.0  # rad/s; the paper's "m/s" can only mean joint space
+MAX_ACCELERATION = 1.2  # rad/s^2 (paper Sec. V-A)
+VELOCITY_GAIN = 25.0  # 1/s; reaches the desired velocity well within a 0.15 s period
+GRIPPER_SPEED = 0.075  # m/s of pad gap: the closing speed in the manufacturer's manual
+GRIPPER_GAIN = 10.0  # N m s/rad, half of what is stable for the fingers at 5 ms steps
+GRIPPER_TORQUE = 3.5  # N m, as in the manufacturer's model: 30-60 N per pad
+FINGER_LENGTH = 0.057  # m, L in gap(q) = 2 (4.1 mm + L cos(q + FINGER_ANGLE))
 FINGER_ANGLE = np.pi / 6
-START_TIME = 1.0
-"""s; clocks start above zero. C MuJoCo sets the clock of a world that it resets to
-zero, so a reset shows even in the first period."""
+START_TIME = 1.0  # s; C MuJoCo resets a clock to 0, so a reset world shows at once
+# Fields of ``PhysicsState`` that MuJoCo's data has too.
 STATE_FIELDS = ("qpos", "qvel", "qacc_warmstart", "mocap_pos", "mocap_quat", "time")
-"""Fields of ``PhysicsState`` that MuJoCo's data has too."""
+# Names in ``PhysicsState.fields`` that are not fields of MuJoCo's model.
+OWN_FIELDS = (
+  "gripper_speed",  # f32[]: replaces GRIPPER_SPEED, m/s
+  "control_delay",  # f32[]: whole physics steps until a command takes effect
+  "background",  # this and the rest: see ``render.appearance.FIELDS``
+  "waves",
+  "odd_rgb",
+  "grain",
+)
 
 
 class PhysicsState(struct.PyTreeNode):
@@ -60,10 +60,8 @@ class Physics(Protocol):
   def step(self, state: PhysicsState, velocity: Array, close: Array) -> PhysicsState:
     """Advances every world by one control period.
 
-    Args:
-      state: [worlds, ...].
-      velocity: f32[worlds, 6], desired joint velocities, rad/s.
-      close: f32[worlds], 1 closes the gripper, 0 opens it.
+    The desired joint velocities [worlds, 6] are in rad/s; a ``close`` [worlds] of 1
+    closes the gripper, 0 opens it.
     """
     ...
 
@@ -71,15 +69,7 @@ class Physics(Protocol):
 def initial_state(
   scene: Scene, qpos: Array, mocap_pos: Array, mocap_quat: Array, variant: Array
 ) -> PhysicsState:
-  """Returns a state at rest.
-
-  Args:
-    scene: sets the sizes and the fields of its variants.
-    qpos: f32[*b, nq].
-    mocap_pos: f32[*b, nmocap, 3].
-    mocap_quat: f32[*b, nmocap, 4].
-    variant: i32[*b], variant of the scene in each world.
-  """
+  """Returns a state at rest, with the fields of each world's variant i32[*b]."""
   batch = qpos.shape[:-1]
   return PhysicsState(
     qpos=qpos,
@@ -92,41 +82,21 @@ def initial_state(
   )
 
 
-OWN_FIELDS = (
-  "gripper_speed",  # f32[]: replaces GRIPPER_SPEED, m/s
-  "control_delay",  # f32[]: whole physics steps until a command takes effect
-  "background",  # f32[3]: this and the rest: see ``render.appearance.FIELDS``
-  "waves",  # f32[ngeom + 1, 3, 4]
-  "odd_rgb",  # f32[ngeom + 1, 3]
-  "grain",  # f32[ngeom + 1]
-)
-"""Names in ``PhysicsState.fields`` that are not fields of MuJoCo's model."""
-
-
 def model_fields(fields: dict[str, Array]) -> dict[str, Array]:
   """Returns those ``PhysicsState.fields`` that replace fields of MuJoCo's model."""
   return {name: value for name, value in fields.items() if name not in OWN_FIELDS}
 
 
 def arm_torque(mass: Any, bias: Any, qvel: Any, desired: Any, limit: Any) -> Any:
-  """Computes the inverse-dynamics torque of the arm; NumPy or JAX arrays.
+  """Computes the inverse-dynamics torque [*b, 6] of the arm; NumPy or JAX arrays.
 
-  tau = M clip(gain (v* - v), +-a_max) + bias, clipped to the joint's limit.
-
-  Args:
-    mass: [*b, 6, 6] arm block of the joint-space mass matrix, kg m^2.
-    bias: [*b, 6] Coriolis, centrifugal and gravity torque, N m.
-    qvel: [*b, 6] joint velocities, rad/s.
-    desired: [*b, 6] desired joint velocities, rad/s.
-    limit: [6] torque limits, N m.
-
-  Returns:
-    [*b, 6] torques, N m.
+  tau = M clip(gain (v* - v), +-a_max) + bias, clipped to the joint's limit. M is the
+  arm's block of the mass matrix, kg m^2; bias is the Coriolis, centrifugal and gravity
+  torque. Velocities are in rad/s, torques in N m.
   """
   desired = desired.clip(-MAX_VELOCITY, MAX_VELOCITY)
-  acceleration = (VELOCITY_GAIN * (desired - qvel)).clip(
-    -MAX_ACCELERATION, MAX_ACCELERATION
-  )
+  acceleration = VELOCITY_GAIN * (desired - qvel)
+  acceleration = acceleration.clip(-MAX_ACCELERATION, MAX_ACCELERATION)
   return ((mass * acceleration[..., None, :]).sum(-1) + bias).clip(-limit, limit)
 
 
@@ -135,20 +105,10 @@ def gripper_torque(
 ) -> Any:
   """Computes the torque of the driven finger: constant pad speed, limited squeeze.
 
-  An explicit servo: C MuJoCo and MJX integrate the saturated force of a MuJoCo
-  velocity actuator differently.
-
-  Args:
-    angle: [*b] driven finger joint, rad, 0 = open.
-    velocity: [*b] its velocity, rad/s.
-    close: [*b] in {0, 1}.
-    xp: ``numpy`` or ``jax.numpy``.
-    speed: [*b] or a number, of the pad gap, m/s.
-
-  Returns:
-    [*b] N m, positive closes.
+  C MuJoCo and MJX integrate the saturated force of a MuJoCo velocity actuator
+  differently, so this is an explicit servo: from the finger's angle (rad, 0 = open) and
+  velocity (rad/s) to N m, positive closes. ``speed`` is that of the pad gap, m/s.
   """
   slope = 2 * FINGER_LENGTH * xp.sin(angle.clip(0.0, 1.1) + FINGER_ANGLE)
   desired = (2 * close - 1) * speed / slope
-  torque = GRIPPER_GAIN * (desired - velocity)
-  return torque.clip(-GRIPPER_TORQUE, GRIPPER_TORQUE)
+  return (GRIPPER_GAIN * (desired - velocity)).clip(-GRIPPER_TORQUE, GRIPPER_TORQUE)

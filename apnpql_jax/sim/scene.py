@@ -30,19 +30,15 @@ class Scene:
   model: mujoco.MjModel
   fingerprint: str  # hash of the compiled models of all variants
   arm_qpos: np.ndarray  # int[6]: addresses of the arm joints in qpos
-  arm_dof: np.ndarray  # int[6]: addresses of the arm joints in qvel
+  arm_dof: np.ndarray  # int[6]: the same in qvel
   gripper_qpos: int  # address of the driven finger joint in qpos
-  gripper_dof: int  # address of the driven finger joint in qvel
+  gripper_dof: int  # the same in qvel
   tool_site: int  # id of the site between the closed finger tips
   cameras: tuple[str, ...]  # names of all cameras
   variants: dict[str, np.ndarray]  # differing model fields, f32[variants, ...]
 
   def id(self, kind: str, name: str) -> int:
-    """Returns the id of a "body", "site", "camera", "geom" or "key" by name.
-
-    Raises:
-      ConfigError: no such name; the message lists the valid ones.
-    """
+    """Returns the id of a "body", "site", "camera", "geom" or "key" by name."""
     return _named_id(self.model, self.name, kind, name)
 
   def free_joint(self, body: str) -> tuple[int, int]:
@@ -70,14 +66,10 @@ def load_scene(
   cameras: Sequence[str] = (),
   variants: Sequence[Callable[[mujoco.MjSpec], None]] = (),
 ) -> Scene:
-  """Compiles ``path`` and checks it.
+  """Compiles an MJCF file that includes the robot, and checks it.
 
-  Args:
-    path: an MJCF file that includes the robot.
-    cameras: camera names that must exist.
-    variants: functions that edit the parsed file, one for each variant of the scene,
-      such as the shape of an object; they must keep its structure. Each world then
-      has one of the variants.
+  ``cameras`` must exist. Each world has one of the ``variants``: functions that edit
+  the parsed file, such as the shape of an object, but keep its structure.
 
   Raises:
     ConfigError: the file does not compile, lacks a joint, site or camera, or
@@ -113,16 +105,11 @@ def _check_supported(model: mujoco.MjModel, name: str) -> None:
   """Checks for features that MJX rejects, or accepts without simulating them.
 
   Source: the MJX-JAX engine of mujoco-mjx 3.17.0 has no code for these.
-
-  Raises:
-    ConfigError: the model uses such a feature.
   """
   option, kinds = model.opt, mujoco.mjtIntegrator
   integrators = kinds.mjINT_EULER, kinds.mjINT_RK4, kinds.mjINT_IMPLICITFAST
-  pgs, sleep = (
-    mujoco.mjtSolver.mjSOL_PGS,
-    getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0),
-  )
+  pgs = mujoco.mjtSolver.mjSOL_PGS
+  sleep = getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0)
   found = {
     "option/noslip_iterations": option.noslip_iterations > 0,
     "option/integrator (valid: Euler, RK4, implicitfast)": (

@@ -47,12 +47,9 @@ class TableTask:
   """Base of the tasks; the scene is ``mjcf/<name>.xml`` with a keyframe ``neutral``."""
 
   name: str
-
-  arm_noise = 0.15
-  """rad; uniform spread of the initial joint angles around the neutral ones."""
+  arm_noise = 0.15  # rad; uniform spread of the initial joint angles around neutral
 
   def __init__(self, variants: Sequence[Callable[[mujoco.MjSpec], None]] = ()):
-    """Compiles the scene; ``variants`` as for ``sim.scene.load_scene``."""
     self.scene = load_scene(
       mjcf_path(self.name), cameras=("global", "wrist", "wide"), variants=variants
     )
@@ -96,12 +93,9 @@ def draw_pair(
   min_distance: float,
   to_xy: Callable[[np.ndarray], np.ndarray] = lambda spots: spots,
 ) -> np.ndarray:
-  """Draws pairs of spots, uniform among those at least ``min_distance`` (m) apart.
+  """Draws f64[2, count, 2] (m), pairs of spots at least ``min_distance`` apart.
 
-  ``ranges`` limit the coordinates of a spot, which ``to_xy`` converts to x and y.
-
-  Returns:
-    f64[2, count, 2], x and y of both spots, m.
+  They are uniform in ``ranges`` of coordinates, which ``to_xy`` converts to x and y.
   """
   low, high = np.array(ranges).T
   pair = to_xy(rng.uniform(low, high, (2, count, 2)))

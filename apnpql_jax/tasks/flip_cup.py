@@ -30,12 +30,10 @@ from apnpql_jax.tasks.base import FreeBody, TableTask, draw_pair
 from apnpql_jax.tasks.task import ResetDraw, ToolTargets, register_task
 from apnpql_jax.types import Array
 
-# Sides, half the width across them in m, height in m of the three cups. Taller than a
-# mug: gripped in the middle, the hand must clear the table by its 27 mm and, at the
-# goal, by the 58 mm of the camera below it.
+# Sides, half the width across them (m) and height (m) of the cups. Taller than a mug:
+# at half the height, the hand (27 mm) and the camera below it (58 mm) clear the table.
 SHAPES = ((8, 0.030, 0.130), (8, 0.037, 0.140), (4, 0.033, 0.150))
-# m and rad; distance from the base's axis and direction of cup and goal. Nearer to the
-# base, wrist 2 would be straight while the hand stands off the cup.
+# m and rad, around the base. Nearer, wrist 2 would be straight at ``STANDOFF``.
 RANGE = ((0.48, 0.60), (-0.5, 0.5))
 MAX_YAW = 0.3  # rad; largest yaw of the cup away from the direction of reach
 MIN_DISTANCE = 0.16  # m between cup and goal: the mark clears the widest cup
@@ -137,14 +135,11 @@ class FlipCup(TableTask):
     empty_roll = jnp.where(flip > 0.9 * np.pi, np.pi / 2, 0.0)
     turn = jnp.where(held, roll + free * (np.pi / 2 - roll), empty_roll)
     heading = jnp.where((held & (free < 1))[:, None], reach, outward)
-    rotations = [
-      _hand(reach, roll),
-      _hand(heading, turn),
-      jnp.broadcast_to(self._neutral_mat, (*roll.shape, 3, 3)),
-    ]
+    at_object, at_goal = _hand(reach, roll), _hand(heading, turn)
+    neutral = jnp.broadcast_to(self._neutral_mat, (*roll.shape, 3, 3))
     positions = self.with_neutral(to_object, to_goal)
     close = pinch.grip(around=around, held=held, done=self._placed(state))
-    return positions, jnp.stack(rotations, 1), close
+    return positions, jnp.stack([at_object, at_goal, neutral], 1), close
 
   def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:
     """Checks that the cup stands upright on the goal, at rest and released."""
@@ -152,11 +147,7 @@ class FlipCup(TableTask):
     return self._placed(state) & self._cup.is_at_rest(state) & away
 
   def objects(self, state: PhysicsState) -> Array:
-    """Returns the poses of cup and goal and the cup's shape, f32[worlds, 12], m.
-
-    They are the cup's center, a point towards its mouth, the goal, and a point half the
-    cup's width along x and half its height above its center.
-    """
+    """Returns the cup's center, a point towards its mouth, the goal, and a corner."""
     cup, (width, height) = self._cup.pos(state), self._half_size(state)
     to_mouth = cup + geometry.POINTER * self._axis(state)
     corner = cup + jnp.stack([width, 0 * width, height], -1)
@@ -167,12 +158,10 @@ class FlipCup(TableTask):
     self, state: PhysicsState, kinematics: Kinematics, primitives: Array
   ) -> Array:
     """Picks, flips and places the cup; withdraws with the goal primitive."""
+    held, done = self._held(state, kinematics), self._placed(state)
+    is_open = self._is_open(state)
     return pinch.pick_and_place(
-      primitives,
-      held=self._held(state, kinematics),
-      done=self._placed(state),
-      is_open=self._is_open(state),
-      withdraw=1,
+      primitives, held=held, done=done, is_open=is_open, withdraw=1
     )
 
   def _half_size(self, state: PhysicsState) -> tuple[Array, Array]:
@@ -185,11 +174,7 @@ class FlipCup(TableTask):
     return geometry.axis(self._cup.quat(state), 2)
 
   def _reach(self, state: PhysicsState, kinematics: Kinematics, held: Array) -> Array:
-    """Returns the horizontal direction of the grasp.
-
-    It is away from the base and square to a face of the cup; where the cup is held, it
-    is that of the hand.
-    """
+    """Returns the grasp's direction: outward, square to a face; if held, the hand's."""
     outward = _direction(self._cup.pos(state))
     radial = jnp.arctan2(outward[:, 1], outward[:, 0])
     face = geometry.axis(self._cup.quat(state), 0)

@@ -1,7 +1,4 @@
-"""Geometry shared by the tasks: headings, rotations, funnels.
-
-Lengths are in m, angles in rad, quaternions wxyz; ``*b`` are any batch axes.
-"""
+"""Geometry shared by the tasks, in m and rad; quaternions are wxyz."""
 
 from __future__ import annotations
 
@@ -10,13 +7,9 @@ from jaxtyping import Bool, Float
 
 from apnpql_jax.types import Array
 
-# m/s; above float32 contact noise, and slow enough to stop within a millimeter: v^2 / 2
-# mu g is 0.7 mm at mu = 0.2.
-REST_SPEED = 0.05
+REST_SPEED = 0.05  # m/s; above contact noise, and stops within 0.7 mm at mu = 0.2
 REST_TURN = 0.5  # rad/s
-# m; a direction is observed as a point this far away, so that a turn by a few degrees
-# weighs as much as a few centimeters.
-POINTER = 0.2
+POINTER = 0.2  # m to the point that a direction is observed as: 0.1 rad counts as 2 cm
 
 
 def norm(x: Float[Array, "*b n"]) -> Float[Array, "*b"]:
@@ -77,8 +70,6 @@ def is_at_rest(twist: Float[Array, "*b 6"]) -> Bool[Array, "*b"]:
 def funnel(
   off: Float[Array, "*b"], *, aligned: float, wide: float
 ) -> Float[Array, "*b"]:
-  """Returns 0 within ``aligned`` (stay down), 1 beyond ``wide``, linear between.
-
-  A step instead would be sharper than a network can see in the images.
-  """
+  """Returns 0 within ``aligned`` (stay down), 1 beyond ``wide``, linear between."""
+  # A step would be sharper than a network can see in the images.
   return ((off - aligned) / (wide - aligned)).clip(0.0, 1.0)

@@ -17,13 +17,10 @@ Mask = Bool[Array, " worlds"]
 Angle = Float[Array, " worlds"]
 Point = Float[Array, "worlds 3"]
 
-TOLERANCE = (
-  0.004  # m; largest difference between the gap and the width of a held object
-)
+TOLERANCE = 0.004  # m; largest difference between the gap and a held object's width
 CLEARANCE = 0.02  # m; spare room of an open hand, both sides together
-# m; the hand may close when its pinch point is this close to the grasp. The closing
-# pads center what stands freely, and a policy with a pixel per centimeter hardly comes
-# closer.
+# m; the hand may close this close to the grasp. The pads center what stands freely, and
+# a policy with a pixel per centimeter hardly comes closer.
 NEAR = 0.012
 LOST = 0.025  # m; an object further from the pinch point is not in the hand
 STRAIGHT = 0.25  # rad; largest twist of a closing hand: the pads turn what is free
@@ -33,30 +30,18 @@ LEVER = 0.05  # m/rad; offset that a twist beyond half of the allowed one counts
 
 @dataclasses.dataclass
 class Pinch:
-  """A grip between the pads on something of known width, by a vertical tool.
-
-  Attributes:
-    scene: gives the tool site and the finger.
-    neutral_mat: the tool's rotation at heading zero.
-    width: m, of what is gripped.
-    hover: m, height over the grasp at which the open finger tips clear the object.
-    travel: m, tool height at which closed fingers clear everything.
-    above: m, distance along the tool from the aimed point to the pads' center.
-    near: m, see ``NEAR``.
-    straight: rad, see ``STRAIGHT``.
-    depth: m, from the tool site back to the aimed point.
-  """
+  """A grip between the pads on something of known width, by a vertical tool."""
 
   scene: Scene
-  neutral_mat: Float[Array, "3 3"]
+  neutral_mat: Float[Array, "3 3"]  # the tool's rotation at heading zero
   _: dataclasses.KW_ONLY
-  width: float
-  hover: float
-  travel: float
-  above: float = 0.0
-  near: float = NEAR
-  straight: float = STRAIGHT
-  depth: float = dataclasses.field(init=False)
+  width: float  # m, of what is gripped
+  hover: float  # m over the grasp at which the open finger tips clear the object
+  travel: float  # m; tool height at which closed fingers clear everything
+  above: float = 0.0  # m along the tool from the aimed point to the pads' center
+  near: float = NEAR  # m
+  straight: float = STRAIGHT  # rad
+  depth: float = dataclasses.field(init=False)  # m, tool site back to the aimed point
 
   def __post_init__(self):
     self.depth = float(pinch_height(self.width)) - self.above
@@ -84,16 +69,10 @@ class Pinch:
   def approach(
     self, state: PhysicsState, kinematics: Kinematics, aim: Point, twist: Angle
   ) -> Point:
-    """Returns the tool position (m) that leads around an object without a collision.
+    """Returns the tool position (m) that leads to a grip at ``aim`` and hits nothing.
 
     A low tool rises first; over the object it descends through a funnel, but not with
     fingers that are closed on nothing; around the object it stays.
-
-    Args:
-      state: the worlds.
-      kinematics: of ``state``.
-      aim: the point to grip, m.
-      twist: of the hand against the object, rad.
     """
     tool = kinematics.site_xpos[:, self.scene.tool_site]
     off = geometry.norm(tool[:, :2] - aim[:, :2]) + off_by(twist, self.straight)
@@ -128,13 +107,8 @@ def off_by(twist: Angle, straight: float = STRAIGHT) -> Array:
 def grip(*, around: Mask, held: Mask, done: Mask) -> Float[Array, "worlds 3"]:
   """Returns the gripper commands of the primitives of a pick-and-place task.
 
-  The hand closes around the object, holds it until it is where it is to be released,
-  and opens there. It is open in the neutral configuration.
-
-  Args:
-    around: the hand may close.
-    held: the object is in the hand.
-    done: the object is where it is to be released.
+  The hand closes around the object and opens where it is to be released (``done``). It
+  is open in the neutral configuration.
   """
   close = (held | around) & ~done
   return jnp.stack([close, close, jnp.zeros_like(close)], 1).astype(jnp.float32)
@@ -150,12 +124,7 @@ def pick_and_place(
 ) -> Float[Array, "worlds 7"]:
   """Returns the actions of the scripted expert: reach, close, carry, open, withdraw.
 
-  Args:
-    primitives: actions of the primitives object, goal and neutral.
-    held: the object is in the hand.
-    done: the object is where it is to be released.
-    is_open: the hand has let go.
-    withdraw: index of the primitive that leads the open hand away.
+  The primitive of index ``withdraw`` leads the open hand away.
   """
   # While the fingers open, stay with the object.
   choice = jnp.where(done, jnp.where(is_open, withdraw, 0), jnp.where(held, 1, 0))

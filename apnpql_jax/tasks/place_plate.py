@@ -26,8 +26,7 @@ from apnpql_jax.tasks.pinch import ALIGNED, FUNNEL, Pinch, grip, pick_and_place
 from apnpql_jax.tasks.task import ResetDraw, ToolTargets, register_task
 from apnpql_jax.types import Array
 
-# m; x and y ranges of the holder and the box, within reach of a vertical tool.
-WORKSPACE = ((0.40, 0.52), (-0.22, 0.22))
+WORKSPACE = ((0.40, 0.52), (-0.22, 0.22))  # m; x and y within a vertical tool's reach
 HOLDER_YAW, BOX_YAW = 0.5, 0.3  # rad; largest yaw of each
 MIN_DISTANCE = 0.26  # m; half the box's diagonal (154 mm), the plate and fingers
 THICKNESS = 0.012  # m; of the plate
@@ -35,16 +34,13 @@ RADIUS = 0.0647  # m; from the plate's center to the middle of a side of its oct
 GRASP_INSET = 0.013  # m from the edge to the center of the pads, which are 20 mm long
 HOVER = 0.06  # m; height over the grasp at which the open finger tips clear the plate
 TRAVEL = 0.22  # m; tool height at which closed fingers clear the plate (135 mm)
-# m and rad; closer than for what stands freely: in the holder the pads can neither
-# center nor turn the plate.
+# m and rad; strict, as the pads can neither center nor turn a plate in its holder.
 NEAR, STRAIGHT = 0.01, 0.12
 LIFT = 0.085  # m; carrying height of a swinging plate over jaws and walls (35, 40 mm)
 FREE = 0.04  # m; from this height on the plate moves sideways at full speed
 INSIDE = (0.12, 0.085)  # m; half the inner length and width of the box
 ON_FLOOR = 0.012  # m; largest height of the plate's lowest point at success
-# m; the gripper has let go when its pinch point is this far outside the circle of
-# grasps on the plate.
-CLEAR = 0.05
+CLEAR = 0.05  # m; released when the pinch point is this far outside the grasp circle
 
 
 @register_task
@@ -71,9 +67,7 @@ class PlacePlate(TableTask):
     """See ``Task.sample_resets``."""
     holder, goal = draw_pair(rng, count, WORKSPACE, MIN_DISTANCE)
     qpos = self.draw_qpos(rng, count)
-    holder_yaw, goal_yaw = (
-      rng.uniform(-spread, spread, count) for spread in (HOLDER_YAW, BOX_YAW)
-    )
+    holder_yaw, goal_yaw = (rng.uniform(-x, x, count) for x in (HOLDER_YAW, BOX_YAW))
     # A quarter turn about y puts the plate on its edge; then it turns with its holder.
     c, _, _, s = yaw_quat(holder_yaw).T
     self._plate.place(qpos, holder, np.stack([c, -s, c, s], -1) / np.sqrt(2))
@@ -103,11 +97,8 @@ class PlacePlate(TableTask):
     box_yaw = geometry.yaw(state.mocap_quat[:, self._goal])
     turn = jnp.where(held & (free < 1), yaw, box_yaw)
     turns = jnp.stack([yaw, turn, 0 * turn], 1)
-    close = grip(
-      around=self._hand.around(kinematics, edge, twist),
-      held=held,
-      done=self._in_box(state),
-    )
+    around = self._hand.around(kinematics, edge, twist)
+    close = grip(around=around, held=held, done=self._in_box(state))
     positions = self.with_neutral(to_object, to_goal)
     return positions, geometry.rotation_z(turns) @ self._neutral_mat, close
 
@@ -118,11 +109,7 @@ class PlacePlate(TableTask):
     return self._in_box(state) & self._plate.is_at_rest(state) & away
 
   def objects(self, state: PhysicsState) -> Array:
-    """Returns the poses of plate and box, f32[worlds, 12], m.
-
-    They are the plate's center and a point on its axis, the box's center and a point
-    along its longer side.
-    """
+    """Returns points: the plate's center and axis, the box's center and longer side."""
     plate, goal = self._plate.pos(state), state.mocap_pos[:, self._goal]
     box_yaw = geometry.yaw(state.mocap_quat[:, self._goal])
     along = jnp.stack([jnp.cos(box_yaw), jnp.sin(box_yaw), 0 * box_yaw], -1)
@@ -133,12 +120,9 @@ class PlacePlate(TableTask):
     self, state: PhysicsState, kinematics: Kinematics, primitives: Array
   ) -> Array:
     """Picks the plate by its edge and places it in the box."""
-    return pick_and_place(
-      primitives,
-      held=self._hand.holds(state, kinematics, self._edge(state)),
-      done=self._in_box(state),
-      is_open=self._hand.is_open(state),
-    )
+    held = self._hand.holds(state, kinematics, self._edge(state))
+    done, is_open = self._in_box(state), self._hand.is_open(state)
+    return pick_and_place(primitives, held=held, done=done, is_open=is_open)
 
   def _axis(self, state: PhysicsState) -> Array:
     """Returns the axis of the disc, which has no sign."""

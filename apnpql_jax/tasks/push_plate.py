@@ -25,21 +25,17 @@ from apnpql_jax.tasks.base import FreeBody, TableTask, draw_pair, yaw_quat
 from apnpql_jax.tasks.task import ResetDraw, ToolTargets, register_task
 from apnpql_jax.types import Array
 
-# m; x and y ranges of plate and goal, within reach of a vertical tool.
-WORKSPACE = ((0.36, 0.58), (-0.24, 0.24))
+WORKSPACE = ((0.36, 0.58), (-0.24, 0.24))  # m; x and y within a vertical tool's reach
 MIN_DISTANCE = 0.12  # m between plate and goal: four times the goal's tolerance
 GOAL_TOLERANCE = 0.03  # m; the mark's radius minus the plate's: inside is solved
-# Cosine of the largest tilt of a plate that lies flat: 14 degrees. Height alone does
-# not exclude a plate upside down, because only its floor touches the table.
-FLAT = 0.97
+FLAT = 0.97  # cosine of 14 degrees; height alone does not exclude a plate upside down
 HOVER_HEIGHT = 0.08  # m; tool height at which the finger tips clear the rim (34 mm)
 CLEAR = 0.05  # m; above this the tool may travel without touching the rim
 DRAG_HEIGHT = 0.012  # m; 6 mm above the plate's floor, the tips' sides against the rim
 LOW = 0.03  # m; the tips drag below this, behind the rim (center line at 22 mm)
 INSIDE = 0.083  # m; radius of the rim's center line
-# m; a tool below this and within the rim goes down to drag under either primitive. Well
-# above the drag height, because a policy that misjudges where the primitives reverse
-# would lift the tool off the plate.
+# m; below this within the rim, both primitives lead down to drag. Well above the drag
+# height, because a policy that misjudges where they reverse would lift off the plate.
 CAPTURE = 0.06
 ALIGNED = 0.02  # m; the tool descends this close to the axis, 33 mm from the rim
 FUNNEL = 0.055  # m; the height falls linearly from here to ``ALIGNED``
@@ -95,17 +91,14 @@ class PushPlate(TableTask):
 
   def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:
     """Checks that the plate is within 3 cm of the goal, flat on the table, at rest."""
-    del kinematics
     plate, goal = self._plate.pos(state), state.mocap_pos[:, self._goal]
     near = geometry.norm(plate[:, :2] - goal[:, :2]) < GOAL_TOLERANCE
     flat = geometry.axis(self._plate.quat(state), 2)[:, 2] > FLAT
     return near & self._plate.is_at_rest(state) & (plate[:, 2] < 0.01) & flat
 
   def objects(self, state: PhysicsState) -> Array:
-    """Returns the positions of plate and goal, f32[worlds, 6], m."""
-    return jnp.concatenate(
-      [self._plate.pos(state), state.mocap_pos[:, self._goal]], axis=-1
-    )
+    """Returns the positions of plate and goal."""
+    return jnp.concatenate([self._plate.pos(state), state.mocap_pos[:, self._goal]], -1)
 
   def expert(
     self, state: PhysicsState, kinematics: Kinematics, primitives: Array

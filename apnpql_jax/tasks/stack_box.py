@@ -24,8 +24,7 @@ from apnpql_jax.tasks.pinch import ALIGNED, FUNNEL, Pinch, grip, pick_and_place
 from apnpql_jax.tasks.task import ResetDraw, ToolTargets, register_task
 from apnpql_jax.types import Array
 
-# m; x and y ranges of both boxes, within reach of a vertical tool.
-WORKSPACE = ((0.38, 0.56), (-0.22, 0.22))
+WORKSPACE = ((0.38, 0.56), (-0.22, 0.22))  # m; x and y within a vertical tool's reach
 MAX_YAW = 0.25  # rad; largest yaw of a box
 MIN_DISTANCE = 0.13  # m; open fingers (107 mm) around one box clear the other
 SIDE = 0.05  # m; edge of a box
@@ -45,9 +44,8 @@ class StackBox(TableTask):
 
   def __init__(self):
     super().__init__()
-    self._yellow, self._blue = (
-      FreeBody(*self.scene.free_joint(name)) for name in ("yellow", "blue")
-    )
+    self._yellow = FreeBody(*self.scene.free_joint("yellow"))
+    self._blue = FreeBody(*self.scene.free_joint("blue"))
     # Four millimeters above the center, for room between fingers and table.
     self._hand = Pinch(
       self.scene, self._neutral_mat, width=SIDE, hover=HOVER, travel=TRAVEL, above=0.004
@@ -80,11 +78,8 @@ class StackBox(TableTask):
 
     positions = self.with_neutral(to_object, to_goal)
     turns = jnp.stack([yaw, yaw * held, 0 * yaw], 1)
-    close = grip(
-      around=self._hand.around(kinematics, yellow, twist),
-      held=held,
-      done=self._placed(state),
-    )
+    around = self._hand.around(kinematics, yellow, twist)
+    close = grip(around=around, held=held, done=self._placed(state))
     return positions, geometry.rotation_z(turns) @ self._neutral_mat, close
 
   def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:
@@ -97,11 +92,7 @@ class StackBox(TableTask):
     return stacked & on_table & at_rest & away
 
   def objects(self, state: PhysicsState) -> Array:
-    """Returns two points of either box, f32[worlds, 12], m.
-
-    They are its center and a point beyond the face nearest to the world's x axis: boxes
-    look the same after a quarter turn.
-    """
+    """Returns the center of each box and a point beyond its face nearest to +x."""
     parts = []
     for box in (self._yellow, self._blue):
       angle, center = _face_heading(state, box), box.pos(state)
@@ -113,12 +104,9 @@ class StackBox(TableTask):
     self, state: PhysicsState, kinematics: Kinematics, primitives: Array
   ) -> Array:
     """Picks the yellow box and places it on the blue one."""
-    return pick_and_place(
-      primitives,
-      held=self._hand.holds(state, kinematics, self._yellow.pos(state)),
-      done=self._placed(state),
-      is_open=self._hand.is_open(state),
-    )
+    held = self._hand.holds(state, kinematics, self._yellow.pos(state))
+    done, is_open = self._placed(state), self._hand.is_open(state)
+    return pick_and_place(primitives, held=held, done=done, is_open=is_open)
 
   def _placed(self, state: PhysicsState) -> Array:
     """Checks that the yellow box is placed well enough to be released."""
@@ -133,4 +121,5 @@ class StackBox(TableTask):
 
 def _face_heading(state: PhysicsState, box: FreeBody) -> Array:
   """Returns the heading of the box's face nearest to the world's x axis, rad."""
+  # The box looks the same after a quarter turn.
   return geometry.fold(geometry.level_heading(box.quat(state)), np.pi / 2)

@@ -1,8 +1,7 @@
 """The interface of a task: scene, resets, success, tool targets, scripted expert.
 
 A task is one Python file, one MJCF file and one preset. Everything is batched over
-worlds on the first axis; positions are in m in the world frame. Shapes in annotations
-are jaxtyping's and are not checked at run time.
+worlds on the first axis; positions are in m in the world frame.
 """
 
 from __future__ import annotations
@@ -30,11 +29,10 @@ class ResetDraw(NamedTuple):
   variant: Int[np.ndarray, " n"]  # of the scene
 
 
+# Positions (m), rotations and gripper commands (1 closes) for object, goal, neutral.
 ToolTargets = tuple[
   Float[Array, "worlds 3 3"], Float[Array, "worlds 3 3 3"], Float[Array, "worlds 3"]
 ]
-"""Positions (m), rotations and gripper commands (1 closes) of the primitives target
-object, desired goal and neutral configuration."""
 
 
 class Task(Protocol):
@@ -66,10 +64,7 @@ class Task(Protocol):
     kinematics: Kinematics,
     primitives: Float[Array, "worlds 3 7"],
   ) -> Float[Array, "worlds 7"]:
-    """Returns the actions of the scripted expert, which uses privileged state.
-
-    ``primitives`` are the actions that follow each primitive.
-    """
+    """Returns the scripted expert's actions, given those that follow the primitives."""
 
 
 T = TypeVar("T", bound=Task)
@@ -77,11 +72,9 @@ _REGISTRY: dict[str, type[Task]] = {}
 
 
 def register_task(task: type[T]) -> type[T]:
-  """Registers a task under its ``name``, as a class decorator.
+  """Registers a task class under its ``name``, as a decorator.
 
-  Raises:
-    ConfigError: another class has this name. The same class of a reloaded module may
-      replace itself.
+  Raises ``ConfigError`` if another class has this name; a reloaded one replaces itself.
   """
   holder = _REGISTRY.setdefault(task.name, task)
   if (holder.__module__, holder.__qualname__) != (task.__module__, task.__qualname__):
@@ -102,10 +95,6 @@ def task_names() -> list[str]:
 
 
 def make_task(name: str) -> Task:
-  """Builds the task ``name``.
-
-  Raises:
-    ConfigError: unknown name; the message lists the valid ones.
-  """
+  """Builds the task ``name``; an unknown name raises ``ConfigError``."""
   check_name("task", name, task_names())
   return _REGISTRY[name]()

@@ -15,9 +15,9 @@ import numpy as np
 from apnpql_jax import devices
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config.schema import EnvConfig
-from apnpql_jax.console import say
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.runs import checkpoint_reader, leaves, run_folder
+from apnpql_jax.runs.console import say
 from apnpql_jax.runs.metrics import wilson_interval
 from apnpql_jax.training.rollout import (
   Episodes,
@@ -54,10 +54,8 @@ def play_held_out(
     play(params, jnp.asarray(batch), jax.random.fold_in(key, i))
     for i, batch in enumerate(padded)
   ]
-  success, length = (
-    np.concatenate([np.asarray(getattr(p, f)) for p in played])[:episodes]
-    for f in ("success", "length")
-  )
+  success = np.concatenate([p.success for p in played])[:episodes]
+  length = np.concatenate([p.length for p in played])[:episodes]
   return played[0].replace(success=success, length=length)
 
 
@@ -102,7 +100,7 @@ def evaluate(
   """
   began = time.monotonic()
   config = run_folder.open_run(run_dir).config
-  checkpoint_reader.check(run_dir, step, config=config)
+  checkpoint_reader.restore(run_dir, step, {}, config=config)  # Fails early.
   env_config = dataclasses.replace(config.env, backend=backend or config.env.backend)
   env = make_env(env_config, instants=config.agent.lstm_instants)
   agent = make_agent(config.agent)

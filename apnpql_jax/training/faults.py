@@ -21,7 +21,6 @@ from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.data import npz
 from apnpql_jax.errors import FileError, one_line
 from apnpql_jax.runs import leaves, run_folder
-from apnpql_jax.runs.run_folder import RunFolder
 from apnpql_jax.training.iteration import make_sample
 from apnpql_jax.training.state import TrainState
 from apnpql_jax.types import Observation, Slot, TimeStep, Transition
@@ -39,28 +38,18 @@ _NESTED = {
 """Types of the fields of a transition, and of these, that are not arrays."""
 
 
-def check(config: TrainConfig, state: TrainState, folder: RunFolder) -> None:
+def check(config: TrainConfig, state: TrainState, run_dir: Path) -> None:
   """Stops a run if its last ``max_skipped_updates`` updates were skipped.
 
   Raises:
-    RunStopped: They were; the message contains the command that repeats the last one
-      from a saved file.
+    RunStopped: They were. Learner, batch and key of the last one are saved, and the
+      message contains the command that repeats it.
   """
   skipped = int(state.faults.in_a_row)
   if skipped < config.max_skipped_updates:
     return
-  folder.faults.mkdir(exist_ok=True)
-  path = folder.faults / f"step_{int(state.env_steps):08d}.npz"
-  write(path, config, state)
-  raise errors.RunStopped(
-    f"{skipped} updates in a row were not finite; repeat the last one with: "
-    f"apnpql repeat {path}",
-    errors.FAILED,
-  )
-
-
-def write(path: Path, config: TrainConfig, state: TrainState) -> None:
-  """Saves learner, batch and key of the last skipped update."""
+  path = run_dir / "faults" / f"step_{int(state.env_steps):08d}.npz"
+  path.parent.mkdir(exist_ok=True)
   sample_key, learn_key = jax.random.split(state.faults.key)
   sample = make_sample(config, make_agent(config.agent))
   batch = sample(state.replay, state.expert_replay, sample_key)
@@ -70,6 +59,11 @@ def write(path: Path, config: TrainConfig, state: TrainState) -> None:
   )
   if devices.is_primary():
     np.savez(path, **arrays)
+  raise errors.RunStopped(
+    f"{skipped} updates in a row were not finite; repeat the last one with: "
+    f"apnpql repeat {path}",
+    errors.FAILED,
+  )
 
 
 def repeat(path: Path) -> dict[str, list[str]]:
@@ -80,7 +74,7 @@ def repeat(path: Path) -> dict[str, list[str]]:
     after the update, and in the metrics.
 
   Raises:
-    FileError: The file was not made by ``write``, or is not in its run folder.
+    FileError: The file was not made by ``check``, or is not in its run folder.
   """
   config = run_folder.load_run_config(path.absolute().parent.parent)
   arrays = npz.read(path, limit=_MAX_BYTES)

@@ -18,7 +18,7 @@ from apnpql_jax.training.expert import add_chunk
 from apnpql_jax.training.placement import place
 from apnpql_jax.training.rollout import agent_policy, rollout
 from apnpql_jax.training.state import Faults, TrainState
-from apnpql_jax.types import Array, Metrics, Slot, Transition
+from apnpql_jax.types import Metrics, Transition
 
 Iteration = Callable[[TrainState], tuple[TrainState, Metrics]]
 
@@ -43,7 +43,10 @@ def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
       update, (state.learner, state.faults), keys
     )
     metrics = {name: jnp.mean(x, where=ok) for name, x in metrics.items()}
-    metrics |= _rollout_metrics(chunk) | {
+    metrics |= {
+      "rollout/successes": chunk.timestep.terminated.sum(),
+      "rollout/timeouts": chunk.timestep.truncated.sum(),
+      "rollout/close_share": chunk.action[..., -1].mean(),
       "faults/worlds": (worlds.faults - state.env.faults).sum(),
       "faults/updates": (~ok).sum(),
       "faults/updates_in_a_row": faults.in_a_row,
@@ -71,7 +74,8 @@ def _update(agent, sample, ring, expert_replay, carry, key) -> Any:
   # Gradient norms cover all losses and parameters. A non-finite reward in the batch can
   # vanish in the clipping of the projection.
   norms = {k: v for k, v in metrics.items() if k.startswith("grad_norm/")}
-  ok = all_finite((batch, norms, updated.nu))
+  leaves = jax.tree.leaves((batch, norms, updated.nu))
+  ok = jnp.stack([jnp.isfinite(x).all() for x in leaves]).all()
   learner = jax.tree.map(functools.partial(jnp.where, ok), updated, learner)
   faults = Faults(
     in_a_row=jnp.where(ok, 0, faults.in_a_row + 1),
@@ -103,16 +107,3 @@ def make_sample(
     return place(jax.lax.with_sharding_constraint(draw(*args), whole), mesh)
 
   return sample
-
-
-def all_finite(tree: Any) -> Array:
-  """Returns bool[]: whether no leaf contains a NaN or an infinity."""
-  return jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(tree)]).all()
-
-
-def _rollout_metrics(chunk: Slot) -> Metrics:
-  return {
-    "rollout/successes": chunk.timestep.terminated.sum(),
-    "rollout/timeouts": chunk.timestep.truncated.sum(),
-    "rollout/close_share": chunk.action[..., -1].mean(),
-  }

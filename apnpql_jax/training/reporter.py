@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 import time
 from typing import Any
 
@@ -13,7 +14,6 @@ from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.envs.env import Env
 from apnpql_jax.runs.metrics import MetricWriter, plot_curve, read_evaluations
 from apnpql_jax.runs.progress import TrainProgress
-from apnpql_jax.runs.run_folder import RunFolder
 from apnpql_jax.training.evaluate import figures_of, play_held_out
 from apnpql_jax.training.rollout import agent_policy, make_player
 from apnpql_jax.training.state import TrainState
@@ -23,39 +23,21 @@ EVAL_SEED = 1
 """Seed of evaluations during training, which all play the same held-out episodes."""
 
 
-class Silent:
-  """The reporter of all processes but the first: it does nothing."""
-
-  def __init__(self, folder: RunFolder):
-    """Stores the folder; writes nothing."""
-    self.folder = folder
-    self.evaluation: dict[str, Any] = {}
-
-  def iteration(self, step: int, updates: int, metrics: dict[str, Any]) -> None:
-    """Does nothing."""
-
-  def evaluate(self, step: int, state: TrainState, *, last: bool) -> None:
-    """Does nothing."""
-
-  def write(self, step: int, figures: dict[str, Any]) -> None:
-    """Does nothing."""
-
-
 class Reporter:
-  """The reporter of the first process."""
+  """Writes and displays a run; only the first process has one."""
 
   def __init__(
     self,
     config: TrainConfig,
     env: Env,
     agent: Agent,
-    folder: RunFolder,
+    run_dir: Path,
     writer: MetricWriter,
     progress: TrainProgress,
   ):
     """Builds the player of evaluations without compiling it."""
-    self._config, self._env, self.folder = config, env, folder
-    self._writer, self._progress = writer, progress
+    self._config, self._env, self._run_dir = config, env, run_dir
+    self.writer, self._progress = writer, progress
     self._play = make_player(
       env, lambda params: agent_policy(agent, params, greedy=False)
     )
@@ -71,17 +53,13 @@ class Reporter:
     steps = config.rollout_length * config.env.worlds
     metrics["time/sps_e2e"] = steps / seconds
     metrics["time/updates_per_s"] = config.updates_per_iteration / seconds
-    self._writer.write(step, metrics)
+    self.writer.write(step, metrics)
     self._progress.update(step, updates=updates)
-
-  def write(self, step: int, figures: dict[str, Any]) -> None:
-    """Adds a row to the metrics."""
-    self._writer.write(step, figures)
 
   def evaluate(self, step: int, state: TrainState, *, last: bool) -> float:
     """Plays held-out episodes; writes metrics, the curve and, at the end, a video."""
     began = time.monotonic()
-    config, folder = self._config, self.folder
+    config, run_dir = self._config, self._run_dir
     params = devices.local(state.learner.target_params)
     played = play_held_out(
       self._env, self._play, params, episodes=config.eval_episodes, seed=EVAL_SEED
@@ -89,10 +67,11 @@ class Reporter:
     self.evaluation = figures = figures_of(played)
     row = {f"eval/{name}": value for name, value in figures.items() if name != "ci95"}
     row["eval/ci95_low"], row["eval/ci95_high"] = figures["ci95"]
-    self._writer.write(step, row | {"eval/wall_s": time.monotonic() - began})
-    plot_curve(read_evaluations(folder.path), folder.curve, title=config.env.task)
+    self.writer.write(step, row | {"eval/wall_s": time.monotonic() - began})
+    rows = read_evaluations(run_dir)
+    plot_curve(rows, run_dir / "curve.png", title=config.env.task)
     if config.video and last:
-      record_episodes(self._env, played, folder.videos / f"step_{step:08d}.mp4")
+      record_episodes(self._env, played, run_dir / "videos" / f"step_{step:08d}.mp4")
     rate = figures["success_rate"]
     self._progress.message(
       f"step {step:,}: {figures['successes']} of {figures['episodes']} held-out "

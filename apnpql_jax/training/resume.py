@@ -31,7 +31,7 @@ def to_items(state: TrainState, *, whole: bool) -> dict[str, Any]:
 def restore(
   config: TrainConfig, run_dir: Path, example: TrainState, warn: Callable[[str], None]
 ) -> TrainState:
-  """Returns the newest training state that can be read; the inverse of ``to_items``.
+  """Returns the newest training state that can be read.
 
   Takes the state as ShapeDtypeStructs, and calls ``warn`` with a line for each damaged
   checkpoint and for an older replay.

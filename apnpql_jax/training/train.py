@@ -5,13 +5,11 @@ It keeps no state; everything needed to resume is in ``TrainState``.
 
 from __future__ import annotations
 
-from collections.abc import Generator
 import contextlib
-import dataclasses
 import logging
 from pathlib import Path
 import signal
-from typing import Any
+from typing import Any, NamedTuple
 
 from jax.sharding import Mesh
 
@@ -19,35 +17,32 @@ from apnpql_jax import devices, errors
 from apnpql_jax.agents.learner import Agent, make_agent
 from apnpql_jax.config import codec
 from apnpql_jax.config.schema import TrainConfig
-from apnpql_jax.console import say
 from apnpql_jax.data import demonstrations, replay
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.errors import RunStopped
 from apnpql_jax.runs import checkpoint_reader, leaves, run_folder, versions
 from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
+from apnpql_jax.runs.console import say
 from apnpql_jax.runs.metrics import MetricWriter
 from apnpql_jax.runs.progress import TrainProgress
-from apnpql_jax.runs.run_folder import RunFolder
 from apnpql_jax.runs.signals import Signals
 from apnpql_jax.runs.sinks import check_sinks, make_sinks
 from apnpql_jax.training import expert, faults
 from apnpql_jax.training.expert import ExpertReplay, collect_expert
 from apnpql_jax.training.iteration import make_iteration
-from apnpql_jax.training.reporter import Reporter, Silent
+from apnpql_jax.training.reporter import Reporter
 from apnpql_jax.training.resume import restore, set_aside, to_items
 from apnpql_jax.training.state import TrainState, example_state, initial_state
 
 
-@dataclasses.dataclass(frozen=True)
-class Start:
+class Start(NamedTuple):
   """A run ready to train."""
 
   env: Env
   agent: Agent
-  folder: RunFolder
+  path: Path  # of the run folder, absolute
   state: TrainState
-  resume_step: int | None
-  """Step to resume from; None for a new run."""
+  resume_step: int | None  # None for a new run
 
 
 def train(
@@ -80,7 +75,7 @@ def train(
     f"stopped before the first iteration; {hint if resume else 'nothing is saved'}"
   ) as signals:
     start = _start(config, run_dir, mesh, resume=resume, overwrite=overwrite)
-    _say(f"run folder {start.folder.path}; compiling, which can take minutes")
+    _say(f"run folder {start.path}; compiling, which can take minutes")
     try:
       state, evaluation = _run(config, start, signals)
     except OSError as error:  # The disk is full or gone.
@@ -92,7 +87,7 @@ def train(
       f"saved at step {int(state.env_steps):,}; {hint}", errors.INTERRUPTED + number
     )
   return {
-    "run": str(start.folder.path),
+    "run": str(start.path),
     "env_steps": int(state.env_steps),
     "updates": int(state.learner.step),
     **evaluation,
@@ -103,45 +98,32 @@ def _run(
   config: TrainConfig, start: Start, signals: Signals
 ) -> tuple[TrainState, dict[str, Any]]:
   """Opens the outputs and trains; returns the state and the last evaluation."""
-  path = start.folder.path
-  with (
-    run_folder.lock(path) if devices.is_primary() else contextlib.nullcontext(),
-    _reporting(config, start) as reporter,
-    CheckpointWriter(path, config, keep=config.keep_checkpoints) as saver,
-  ):
+  path, resume_step = start.path, start.resume_step
+  reporter: Reporter | None = None  # Only in the first process.
+  with contextlib.ExitStack() as stack:
+    if devices.is_primary():
+      stack.enter_context(run_folder.lock(path))
+      if resume_step is not None and (aside := set_aside(path, resume_step)):
+        say(f"later checkpoints and a copy of the metrics were moved to {aside}")
+    devices.barrier()
+    if devices.is_primary():
+      sinks = make_sinks(config.sinks, path, dict(codec.flatten(config)))
+      writer = MetricWriter(path, resume_step=resume_step, sinks=sinks)
+      stack.enter_context(writer)
+      progress = stack.enter_context(TrainProgress(config.total_steps))
+      env = start.env.on_one_device()
+      reporter = Reporter(config, env, start.agent, path, writer, progress)
+    saver = CheckpointWriter(path, config, keep=config.keep_checkpoints)
+    stack.enter_context(saver)
     iteration: Any = make_iteration(config, start.env, start.agent)
     if start.env.mesh is not None:
       iteration = iteration.lower(start.state).compile()
       devices.barrier()
-    state = _loop(config, iteration, start.state, reporter, saver, signals)
-    if figures := saver.finished(wait=True):
-      reporter.write(int(state.env_steps), figures)
-  return state, reporter.evaluation
-
-
-@contextlib.contextmanager
-def _reporting(
-  config: TrainConfig, start: Start
-) -> Generator[Reporter | Silent, None, None]:
-  """Yields the reporter, which is silent in all but the first process."""
-  devices.run_on_primary(lambda: _set_aside(start))
-  if not devices.is_primary():
-    yield Silent(start.folder)
-    return
-  path = start.folder.path
-  sinks = make_sinks(config.sinks, path, dict(codec.flatten(config)))
-  with (
-    MetricWriter(path, resume_step=start.resume_step, sinks=sinks) as writer,
-    TrainProgress(config.total_steps) as progress,
-  ):
-    env = start.env.on_one_device()
-    yield Reporter(config, env, start.agent, start.folder, writer, progress)
-
-
-def _set_aside(start: Start) -> None:
-  path, step = start.folder.path, start.resume_step
-  if step is not None and (aside := set_aside(path, step)):
-    _say(f"later checkpoints and a copy of the metrics were moved to {aside}")
+    state = _loop(config, start, iteration, reporter, saver, signals)
+    figures = saver.finished(wait=True)
+    if reporter and figures:
+      reporter.writer.write(int(state.env_steps), figures)
+  return state, reporter.evaluation if reporter else {}
 
 
 def _start(
@@ -158,30 +140,30 @@ def _start(
   check_sinks(config.sinks)
   count = mesh.size if mesh else 1
   if resume:
-    folder = run_folder.open_run(run_dir)
-    for change in versions.changed_versions(folder.versions, devices=count):
+    path = run_folder.open_run(run_dir).path
+    for change in versions.changed_versions(path, devices=count):
       _say(f"changed since the run began: {change}")
   saved = resume and checkpoint_reader.latest_step(run_dir) is not None
   if saved:
-    checkpoint_reader.check(run_dir, None, config=config)
+    checkpoint_reader.restore(run_dir, None, {}, config=config)  # Fails early.
   env = make_env(config.env, mesh, instants=config.agent.lstm_instants)
   agent = make_agent(config.agent)
   example = example_state(config, env, agent)
   devices.check_memory(leaves.nbytes(example), "the training state")
   if saved:
     state = restore(config, run_dir, example, _say)
-    return Start(env, agent, folder, state, int(state.env_steps))
+    return Start(env, agent, path, state, int(state.env_steps))
   state = initial_state(config, env, agent, _expert(config, env))
   if state.expert_replay is not None:
     solved, ended = map(int, replay.episodes(state.expert_replay))
     _say(f"expert replay: {solved} of {ended} episodes solved")
   if resume:
     _say("the run has no checkpoint yet and starts from the beginning")
-    return Start(env, agent, folder, state, 0)
+    return Start(env, agent, path, state, 0)
   devices.run_on_primary(
     lambda: run_folder.create(run_dir, config, overwrite=overwrite, devices=count)
   )
-  return Start(env, agent, run_folder.open_run(run_dir), state, None)
+  return Start(env, agent, run_folder.open_run(run_dir).path, state, None)
 
 
 def _expert(config: TrainConfig, env: Env) -> ExpertReplay:
@@ -195,24 +177,26 @@ def _expert(config: TrainConfig, env: Env) -> ExpertReplay:
   return lambda config, env, _: expert.replay_from_demonstrations(demos, config, env)
 
 
-def _loop(config, iteration, state, reporter, saver, signals) -> TrainState:
+def _loop(config, start, iteration, reporter, saver, signals) -> TrainState:
   """Iterates to the last step; evaluates and saves at multiples of the intervals."""
-  step, stop = int(state.env_steps), False
+  state, stop = start.state, False
+  step = int(state.env_steps)
   while step < config.total_steps and not stop:
     before = step
     state, metrics = iteration(state)
     step = int(state.env_steps)
     # Before the report: from then on there is something to save.
-    hint = f"to continue: --resume {reporter.folder.path}"
-    signals.finish_first(f"stopped at once; {hint}")
-    reporter.iteration(step, int(state.learner.step), metrics | saver.finished())
-    faults.check(config, state, reporter.folder)
+    signals.finish_first(f"stopped at once; to continue: --resume {start.path}")
+    metrics |= saver.finished()
+    if reporter:
+      reporter.iteration(step, int(state.learner.step), metrics)
+    faults.check(config, state, start.path)
     done = step >= config.total_steps
     rate = None
     # Check for signals first, so that saving does not wait for an evaluation.
     stop = devices.any_process(signals.caught)
     if not stop and (done or _passed(before, step, config.eval_every)):
-      rate = reporter.evaluate(step, state, last=done)
+      rate = reporter.evaluate(step, state, last=done) if reporter else None
       stop = devices.any_process(signals.caught)
     last = done or stop
     whole = _passed(before, step, config.save_replay_every or config.checkpoint_every)

@@ -18,17 +18,12 @@ from apnpql_jax.training.rollout import Episodes
 GREEN = (40, 200, 80)
 RED = (220, 60, 50)
 
-_GAP = 2
-"""Black pixels between views."""
-
-_BORDER = 4
-"""Width of a border in pixels."""
-
-_MACROBLOCK = 16
-"""Common video codecs need sides that are multiples of this."""
+_GAP = 2  # black pixels between views
+_BORDER = 4  # width of a border in pixels
+_MACROBLOCK = 16  # video codecs need sides that are multiples of this
 
 VIEW_SIZE = (506, 674)
-"""Height and width of the view of the robot in pixels; both cameras fit beside it, the
+"""Height and width of the view of the robot in pixels; both cameras fit next to it, the
 global one enlarged four times and that on the wrist six times."""
 
 HOLD = 4
@@ -36,15 +31,10 @@ HOLD = 4
 
 
 def record_episodes(env: Env, played: Episodes, path: Path) -> Path:
-  """Writes episodes one after another as one video.
-
-  Args:
-    env: the worlds in which they were played.
-    played: the episodes, of which the first are filmed.
-    path: of the file to write; its folder is made.
+  """Writes the first episodes as one video; creates the folder of ``path``.
 
   Returns:
-    the path that was written, see ``write_video``.
+    The path that was written, see ``write_video``.
   """
   frames = np.concatenate(film(env, played))
   path.parent.mkdir(parents=True, exist_ok=True)
@@ -65,7 +55,7 @@ def film(env: Env, played: Episodes) -> list[np.ndarray]:
   draw = jax.jit(lambda physics: [env.view(camera, physics) for camera in cameras])
   episodes = []
   for episode in range(played.states.time.shape[1]):
-    # What comes later was never reached; drawn all the same, one program serves all.
+    # Draw later time steps too, although never reached, so that one program suffices.
     instants = int(played.length[episode]) + 1
     physics = jax.tree.map(lambda x: x[:, episode], played.states)  # noqa: B023
     frames = tile([np.asarray(view)[:instants] for view in draw(physics)])
@@ -88,7 +78,7 @@ def tile(views: Sequence[np.ndarray]) -> np.ndarray:
     u8[T, H, W, 3].
 
   Raises:
-    ValueError: the views are not videos of equal length.
+    ValueError: The views are not videos of equal length.
   """
   for view in views:
     _check(view)
@@ -118,12 +108,7 @@ def _enlarge(frames: np.ndarray, factor: int) -> np.ndarray:
 
 
 def add_border(frames: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
-  """Returns a copy with a border inside the frames, for instance green for success.
-
-  Args:
-    frames: u8[T, H, W, 3].
-    color: red, green, blue in 0..255.
-  """
+  """Returns a copy of u8[T, H, W, 3] with a border of an RGB color inside."""
   _check(frames)
   out = np.empty_like(frames)
   out[:] = color
@@ -136,16 +121,16 @@ def write_video(path: Path, frames: np.ndarray, *, fps: float) -> Path:
   """Writes frames as MP4, or as GIF if the path ends in ".gif".
 
   Args:
-    path: file to write; any suffix other than ".gif" becomes ".mp4".
+    path: File to write; any suffix other than ".gif" becomes ".mp4".
     frames: u8[T, H, W, 3]; padded with black to what the codec needs.
-    fps: frames per second of playback.
+    fps: Frames per second of playback.
 
   Returns:
     The path that was written.
 
   Raises:
-    ValueError: the frames are not u8[T, H, W, 3], or there are none.
-    OSError: the file cannot be written.
+    ValueError: The frames are not u8[T, H, W, 3], or there are none.
+    OSError: The file cannot be written.
   """
   _check(frames)
   if path.suffix == ".gif":
@@ -154,13 +139,8 @@ def write_video(path: Path, frames: np.ndarray, *, fps: float) -> Path:
   path = path.with_suffix(".mp4")
   padding = [-side % _MACROBLOCK for side in frames.shape[1:3]]
   frames = np.pad(frames, ((0, 0), (0, padding[0]), (0, padding[1]), (0, 0)))
-  _encode(path, frames, fps)
-  return path
-
-
-def _encode(path: Path, frames: np.ndarray, fps: float) -> None:
-  """Writes H.264 with PyAV itself: imageio's PyAV plugin cannot set the rate factor."""
   height, width = frames.shape[1:3]
+  # imageio's PyAV plugin cannot set the rate factor.
   with av.open(str(path), "w") as file:
     stream = file.add_stream("libx264", Fraction(fps).limit_denominator(1000))
     stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
@@ -169,6 +149,7 @@ def _encode(path: Path, frames: np.ndarray, fps: float) -> None:
     for frame in frames:
       file.mux(stream.encode(av.VideoFrame.from_ndarray(frame)))
     file.mux(stream.encode())
+  return path
 
 
 def _check(frames: np.ndarray) -> None:

@@ -26,11 +26,9 @@ from apnpql_jax.training.rollout import agent_policy
 from apnpql_jax.types import ARM_DOF, Array
 from benchmarks.common import floor, timing
 
-PLAYED = 5
-"""Rollouts before anything is timed: nothing moves yet at the reset."""
+PLAYED = 5  # rollouts before anything is timed: nothing moves yet at the reset
 
-Part = tuple[float, float]
-"""Seconds and floor of a part, for all worlds."""
+Part = tuple[float, float]  # seconds and floor of a part, for all worlds
 
 
 def random_policy(state: EnvState, key: Array) -> tuple[Array, Array]:

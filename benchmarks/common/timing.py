@@ -20,8 +20,7 @@ import jax
 from apnpql_jax import devices
 from benchmarks.common import floor, turns
 
-SECONDS = 0.5
-"""Least duration of a repeat."""
+SECONDS = 0.5  # least duration of a repeat
 
 Key = TypeVar("Key")
 

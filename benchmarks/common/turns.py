@@ -10,8 +10,7 @@ import fcntl
 import os
 from pathlib import Path
 
-FOLDER = "BENCHMARK_TURNS"
-"""Environment variable with the folder of the lock files."""
+FOLDER = "BENCHMARK_TURNS"  # environment variable with the folder of the lock files
 
 
 @contextlib.contextmanager

@@ -31,8 +31,7 @@ BLOCKS = (
   *("fidelity", "render", "ray_layouts", "learner", "encoder_layouts", "env_steps"),
   *("end_to_end", "compile_time", "growth", "peers"),
 )
-PANELS = 3
-"""Panels of a plot side by side."""
+PANELS = 3  # panels of a plot side by side
 
 NATIVE = {"backend": "native", "obs": "pixels", "worlds": 32}
 MJX = NATIVE | {"backend": "mjx"}

@@ -135,8 +135,7 @@ def percent(value: float | None) -> str:
   return f"{100 * value:.0f} %" if value >= 0.1 else f"{100 * value:.2g} %"
 
 
-Prepared = tuple[list[Result], list[str]]
-"""Rows of the first table, and further tables."""
+Prepared = tuple[list[Result], list[str]]  # rows of the first table, and further tables
 
 
 def render(report: Report) -> Prepared:

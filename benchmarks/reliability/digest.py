@@ -19,6 +19,7 @@ from apnpql_jax.envs.env import make_env
 from apnpql_jax.training.expert import collect_expert
 from apnpql_jax.training.iteration import make_iteration, make_sample
 from apnpql_jax.training.state import initial_state
+from benchmarks.common import settings
 
 
 def main() -> None:
@@ -55,9 +56,7 @@ def learner(algorithm: str, *, pixels: bool) -> str:
 
 def run(obs: str) -> dict[str, Any]:
   """Returns the first state of a run, a batch, and the state after two iterations."""
-  config = dataclasses.replace(
-    testing.TINY, env=dataclasses.replace(testing.TINY.env, obs=obs)
-  )
+  config = settings.changed(testing.TINY, "env", obs=obs)
   env, agent = make_env(config.env), make_agent(config.agent)
   state = initial_state(config, env, agent, collect_expert)
   iteration, sample = make_iteration(config, env, agent), make_sample(config, agent)

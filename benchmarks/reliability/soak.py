@@ -38,8 +38,7 @@ from apnpql_jax.training import resume
 from apnpql_jax.training.state import example_state
 from benchmarks.common import store
 
-INTERVAL = 512
-"""Environment steps between two checkpoints."""
+INTERVAL = 512  # environment steps between two checkpoints
 
 OPTIONS = f"--checkpoint-every {INTERVAL} --eval-every {64 * INTERVAL}".split()
 OPTIONS += "--replay.capacity 4096 --replay.expert-steps 512".split()
@@ -256,8 +255,11 @@ def poison(run: Path, *, rewards: bool) -> None:
   example = example_state(config, env, agent)
   state = resume.restore(config, run, example, lambda line: None)
   if rewards:
-    rings = {name: getattr(state, name) for name in ("replay", "expert_replay")}
-    state = state.replace(**{name: _no_rewards(x) for name, x in rings.items()})
+    for name in ("replay", "expert_replay"):
+      slots = getattr(state, name).slots
+      timestep = slots.timestep.replace(reward=slots.timestep.reward * jnp.nan)
+      ring = getattr(state, name).replace(slots=slots.replace(timestep=timestep))
+      state = state.replace(**{name: ring})
   else:
     physics = state.env.physics
     physics = physics.replace(qvel=physics.qvel.at[1, 0].set(jnp.nan))
@@ -276,12 +278,6 @@ def flip_a_bit(run: Path, rng: random.Random) -> str:
   data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
   file.write_bytes(data)
   return str(file.relative_to(run))
-
-
-def _no_rewards(ring: Any) -> Any:
-  timestep = ring.slots.timestep
-  timestep = timestep.replace(reward=timestep.reward * jnp.nan)
-  return ring.replace(slots=ring.slots.replace(timestep=timestep))
 
 
 def repeat(dump: Path) -> str:

@@ -32,8 +32,7 @@ from benchmarks.common import command, floor, timing
 from benchmarks.peers import sides, worlds
 
 SCENE = "push_plate"
-Sizes = dict[str, tuple[int, int]]
-"""Height and width of the images, by camera."""
+Sizes = dict[str, tuple[int, int]]  # height and width of the images, by camera
 
 RESOLUTIONS: dict[str, Sizes] = {
   "paper": {"global": (72, 96), "wrist": (36, 64)},

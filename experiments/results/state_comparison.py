@@ -140,7 +140,7 @@ def train(task: str, row: str, seed: int) -> None:
     )
     result = {
       "command": command,
-      "versions": json.loads(open_run(run).versions.read_text()),
+      "versions": json.loads((run / "versions.json").read_text()),
       "config": json.loads((run / "config.json").read_text()),
       "final": final,
       "greedy": greedy,
@@ -155,7 +155,7 @@ def train(task: str, row: str, seed: int) -> None:
 def evaluations(folder: RunFolder) -> list[dict[str, Any]]:
   """Rows of the held-out evaluations, each with the metrics of training before it."""
   found, last = [], {}
-  for row in read_rows(folder.metrics_jsonl):
+  for row in read_rows(folder.path / "metrics.jsonl"):
     last |= {name: x for name, x in row.items() if name.startswith(KEPT)}
     if "eval/success_rate" in row:
       names = ("step", "time/wall_s", "eval/success_rate", "eval/episodes")

@@ -82,7 +82,7 @@ def play(flags: str) -> Played:
   agent, batch = make_agent(config.agent), random_batch(0, BATCH)
   before = agent.init(jax.random.key(0), batch.observation_tm1)
   with jax.numpy_rank_promotion("raise"):
-    update = jax.jit(agent.update, compiler_options=testing.FAST_COMPILE)
+    update = jax.jit(agent.update)
     after, metrics = update(before, batch, jax.random.key(1))
   return Played(config, agent, before, after, metrics)
 

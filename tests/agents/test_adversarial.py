@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from typing import Any
 
 import jax
@@ -11,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from apnpql_jax import testing
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.agents.table_one import ALGORITHMS
 from apnpql_jax.testing import SMALL, random_batch
@@ -67,7 +65,7 @@ def test_no_batch_produces_a_number_that_is_not_finite(name: str, updates: int):
     rich = jnp.abs(batch.reward_t) > 1e5
     return state, (metrics, jnp.any(white & rich))
 
-  @functools.partial(jax.jit, compiler_options=testing.FAST_COMPILE)
+  @jax.jit
   def run(state):
     keys = jax.random.split(jax.random.key(1), updates)
     state, history = jax.lax.scan(body, state, keys)

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax import testing
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.data import replay
@@ -34,7 +33,7 @@ CONFIG = AgentConfig(
 def call(function: Callable, *args: Any) -> Any:
   """Returns the result of ``function``, compiled without optimization for one call."""
   lowered: Any = jax.jit(function).lower(*args)
-  return lowered.compile(compiler_options=testing.FAST_COMPILE)(*args)
+  return lowered.compile()(*args)
 
 
 def episodes(steps: int = 64, worlds: int = 16) -> Replay:

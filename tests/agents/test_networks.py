@@ -155,7 +155,7 @@ def test_an_lstm_reads_what_would_be_phi_of_each_instant():
     h = special.expit(o) * np.tanh(c)
   actual = networks.at(params | {"encoder": without | {"lstm": lstm}}, recent).phi
   np.testing.assert_allclose(actual, h, atol=1e-4)
-  with pytest.raises(ValueError, match="not of 3 instants"):
+  with pytest.raises(ValueError, match="do not have 3 instants"):
     networks.at(params, seen)
 
 

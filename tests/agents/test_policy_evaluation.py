@@ -75,7 +75,6 @@ def test_retrace_over_windows_is_the_sum_over_its_definition(algorithm: str):
   agent, row, params = agent_with(algorithm, "retrace")
   batch = random_batch(3, BATCH, windows=N)
   key = jax.random.key(1)
-  ours = bellman_target(agent.networks, row, agent.evaluation, params, batch, key)
 
   window = batch.window
   assert window is not None
@@ -90,7 +89,11 @@ def test_retrace_over_windows_is_the_sum_over_its_definition(algorithm: str):
     partition = jnp.mean(jnp.exp(policy.q_values / alpha), axis=0)
     log_pi = heads.prior().log_prob(window.action[None])[0] + q[0] / alpha
     log_pi = log_pi - jnp.log(partition)
-  ratio = np.exp(np.asarray(log_pi - window.log_prob, np.float64))
+  # Ratios on both sides of one; those of unrelated densities would vanish.
+  ratio = np.exp(np.random.default_rng(4).normal(size=(BATCH, N)))
+  log_prob = log_pi - jnp.asarray(np.log(ratio), jnp.float32)
+  batch = batch.replace(window=window.replace(log_prob=log_prob))
+  ours = bellman_target(agent.networks, row, agent.evaluation, params, batch, key)
   q, step = np.asarray(q[0], np.float64), jax.device_get(window.timestep)
   expected = []
   for i in range(BATCH):

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from scipy import special
 
-from apnpql_jax import testing
 from apnpql_jax.agents import table_one
 from apnpql_jax.agents.columns import regularizer
 from apnpql_jax.agents.columns.candidates import clip_action
@@ -109,9 +108,7 @@ def example_of(name: str) -> Example:
     return parts, (total, metrics)
 
   with jax.numpy_rank_promotion("raise"):
-    learn = jax.jit(
-      jax.jacrev(losses, has_aux=True), compiler_options=testing.FAST_COMPILE
-    )
+    learn = jax.jit(jax.jacrev(losses, has_aux=True))
     learn(trained, batch)
   return Example(agent, batch, trained, slow, functools.partial(learn, trained))
 

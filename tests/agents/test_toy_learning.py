@@ -50,7 +50,7 @@ class World(struct.PyTreeNode):
   holding: Array  # bool[W]
   success: Array  # bool[W]
   time: Array  # i32[W]
-  held: bool = struct.field(pytree_node=False, default=False)  # Start with it.
+  held: bool = struct.field(pytree_node=False, default=False)  # Starts in the hand.
 
   @property
   def point(self) -> Array:

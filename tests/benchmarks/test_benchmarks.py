@@ -131,10 +131,10 @@ def test_other_layouts_draw_the_same():
   sizes = render.RESOLUTIONS["tiny"]
   scene = load_scene(mjcf_path(render.SCENE))
   poses = render.make_poses(scene, 2)
-  pair = jax.jit(render.make_pair(scene, sizes), compiler_options=testing.FAST_COMPILE)
+  pair = jax.jit(render.make_pair(scene, sizes))
   expected = pair(poses)
   for name in ("fold, 16 blocks", "types at once"):
-    fast: Any = ray_layouts.LAYOUTS[name] | {"options": testing.FAST_COMPILE}
+    fast: Any = ray_layouts.LAYOUTS[name]
     program, _ = ray_layouts.prepare(scene, sizes, poses, **fast)
     assert ray_layouts.agreeing(program(poses), expected) > 0.999
   assert ray_layouts.agreeing([x + 1 for x in expected], expected) == 0.0

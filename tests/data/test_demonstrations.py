@@ -252,6 +252,30 @@ def test_a_recording_becomes_the_demonstrations_it_was_made_of(tmp_path, demos, 
   np.testing.assert_allclose(made.qvel[inside, :6], moved, atol=1e-4)
 
 
+def test_an_even_turn_is_even_between_samples_of_either_sign(tmp_path, demos, env):
+  """A tracker may return q or -q; control periods end between its samples."""
+  free, _ = env.task.scene.free_joint("plate")
+  start, time = demos.qpos[0], 0.2 * np.arange(6)
+  turn = Rotation.from_euler("z", 0.5 * time[:, None])
+  quat = turn.as_quat(scalar_first=True) * (-1.0) ** np.arange(6)[:, None]
+  place = np.tile(start[free : free + 3], (6, 1))
+  goal = np.concatenate([demos.mocap_pos[0, 0], demos.mocap_quat[0, 0]])
+  path = tmp_path / "recording.npz"
+  np.savez(
+    path,
+    time=time,
+    joints=np.tile(start[env.task.scene.arm_qpos], (6, 1)),
+    gripper=np.ones(6),
+    plate=np.concatenate([place, quat], 1),
+    goal=np.tile(goal, (6, 1)),
+    episode=np.zeros(6),
+  )
+  made = real_arm.convert(path, env.task.scene, period_s=0.15)
+  found = Rotation.from_quat(made.qpos[:, free + 3 : free + 7], scalar_first=True)
+  angle = 0.5 * 0.15 * np.arange(7)
+  np.testing.assert_allclose(found.as_rotvec()[:, 2], angle, atol=1e-4)
+
+
 def test_what_a_recording_cannot_tell_is_asked_for(tmp_path, demos, env):
   whole, path = _recording(env, demos), tmp_path / "recording.npz"
 

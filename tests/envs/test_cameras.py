@@ -6,7 +6,6 @@ import jax
 import numpy as np
 import pytest
 
-from apnpql_jax import testing
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.envs.cameras import make_cameras, shadows_of_the_hand
 from apnpql_jax.render import CameraSpec, Geoms, Lighting, render
@@ -26,7 +25,7 @@ def test_the_whole_hand_casts_a_shadow(name):
 
 def test_the_shadow_falls_only_on_the_table_and_flat_marks(task, resets):
   scene = task.scene
-  poses = jax.jit(make_kinematics(scene), compiler_options=testing.FAST_COMPILE)(resets)
+  poses = jax.jit(make_kinematics(scene))(resets)
   plain, shaded = (
     np.asarray(make_cameras(EnvConfig(shadows=shadows), scene)[0](poses), np.int32)
     for shadows in (False, True)

@@ -49,7 +49,15 @@ def pixel_chunk(env):
 
 
 def test_held_out_rows_are_never_trained_on(env):
+  """Where an episode is over, the next one starts from any of the other rows."""
   assert env.bank_split == 192 and env.held_out == 64
+  state, action = env.reset(jnp.arange(16)), jnp.zeros((16, 7))
+  over = state.replace(timestep=state.timestep.replace(truncated=jnp.ones(16, bool)))
+  advance, keys = jax.jit(env.advance), jax.random.split(jax.random.key(0), 150)
+  starts = [np.asarray(advance(over, action, key).physics.qpos) for key in keys]
+  same = (np.concatenate(starts)[:, None] == np.asarray(env._bank.qpos)).all(-1)
+  assert (same.sum(-1) == 1).all()
+  np.testing.assert_array_equal(np.unique(same.argmax(-1)), np.arange(192))
 
 
 @pytest.mark.parametrize("noise", [0.1, 0.0])
@@ -169,6 +177,23 @@ def test_the_player_matches_a_rollout_from_a_reset(env, play):
     instants = slice(last[i] + 1)
     expected = timestep.observation.robot[instants, i, -7:-1]
     np.testing.assert_allclose(joints[instants, i], expected, atol=1e-3)
+
+
+def test_a_world_that_breaks_has_failed_even_if_its_next_episode_succeeds(env):
+  """Every other world breaks in its first period; afterwards the expert plays on."""
+  expert = expert_policy(env, noise=0.0)
+
+  def breaking(broken):
+    def policy(state, key):
+      action, log_prob = expert(state, key)
+      poisoned = broken & (state.faults == 0)
+      return jnp.where(poisoned[:, None], jnp.nan, action), log_prob
+
+    return policy
+
+  rows, broken = env.bank_split + jnp.arange(16), jnp.arange(16) % 2 == 0
+  episodes = make_player(env, breaking)(broken, rows, jax.random.key(0))
+  np.testing.assert_array_equal(episodes.success, ~broken)
 
 
 def test_the_observed_tool_is_where_the_joints_put_it(env):

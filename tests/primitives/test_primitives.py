@@ -84,6 +84,22 @@ def test_refinement_agrees_with_mink(task, small_bank):
     np.testing.assert_allclose(refined[i], q, atol=2e-3)
 
 
+def test_refinement_starts_from_the_nearer_configuration(task):
+  """The distant one is off by more than all steps together, in each joint in turn."""
+  chain, rng = arm.make_chain(task.scene), np.random.default_rng(0)
+  neutral = task.scene.keyframe("neutral")[task.scene.arm_qpos]
+  solution = neutral + rng.uniform(-0.2, 0.2, (12, 6))
+  near = solution + rng.uniform(-0.1, 0.1, (12, 6))
+  too_far = 1.5 * tracking.REFINE_STEPS * tracking.MAX_REFINEMENT
+  distant = solution + too_far * np.tile(np.eye(6), (2, 1))
+  last_is_near = np.arange(12)[:, None] < 6
+  last = np.where(last_is_near, near, distant)
+  present = np.where(last_is_near, distant, near)
+  position, rotation, _ = arm.forward(chain, jnp.asarray(solution))
+  refined = jax.jit(tracking.refine)(chain, last, present, position, rotation)
+  np.testing.assert_allclose(refined, solution, atol=1e-3)
+
+
 def test_following_scales_all_joints_alike():
   """The speed is limited far from the target, brakes nearer, and is linear close by."""
   velocity = tracking.follow(jnp.array([2.0, -1.0, 0, 0, 0, 0]), jnp.zeros(6))

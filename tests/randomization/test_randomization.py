@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from apnpql_jax import testing
 from apnpql_jax.config.ranges import RandomizationConfig
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.envs.env import Env, make_env
@@ -85,7 +83,7 @@ def drawn(task) -> physics.PhysicsState:
 
 
 def _kinematics(task):
-  return jax.jit(make_kinematics(task.scene), compiler_options=testing.FAST_COMPILE)
+  return jax.jit(make_kinematics(task.scene))
 
 
 def _bits(tree) -> list[bytes]:
@@ -142,6 +140,26 @@ def test_draws_fill_their_range_and_differ_between_worlds(task, drawn):
   assert delay.min() >= 0 and 0 < delay.max() <= 6  # Steps of 5 ms in 30 ms.
   light = fields["light_ambient"] + fields["light_diffuse"]
   assert light.max() <= 1.0 + 1e-6
+
+
+@pytest.mark.parametrize(("camera", "share"), [("global", 1.0), ("wrist", 0.1)])
+def test_each_camera_shifts_within_its_own_range(task, drawn, camera, share):
+  index = task.scene.id("camera", camera)
+  shift = drawn.fields["cam_pos"][:, index] - task.scene.model.cam_pos[index]
+  limit = share * ALL.camera_shift
+  assert 0.5 * limit < np.abs(shift).max() <= 1.001 * limit
+
+
+def test_inertia_is_proportional_to_mass(task):
+  """Without changes of size or shape; the robot keeps its mass."""
+  model = task.scene.model
+  fields = _randomized(task, dataclasses.replace(NONE, mass=ALL.mass)).fields
+  heavy = model.body_mass > 0
+  mass = np.asarray(fields["body_mass"])[:, heavy] / model.body_mass[heavy]
+  inertia = np.asarray(fields["body_inertia"])[:, heavy] / model.body_inertia[heavy]
+  np.testing.assert_allclose(inertia, np.repeat(mass[..., None], 3, -1), rtol=1e-5)
+  changed = [model.body(i).name for i in np.flatnonzero(heavy)[np.ptp(mass, 0) > 0.1]]
+  assert changed == ["plate"]
 
 
 def test_geoms_of_the_robot_change_their_color_together(task, drawn):
@@ -263,7 +281,7 @@ def test_both_engines_move_the_same_worlds(task, drawn):
   drawn = drawn.replace(qpos=drawn.qpos.at[:, fingers].set(0.6))
   for name in ("native", "mjx"):
     engine = engines.make_physics(name, task.scene, substeps=10)
-    step = jax.jit(engine.step, compiler_options=testing.FAST_COMPILE)
+    step = jax.jit(engine.step)
     moved[name] = step(step(drawn, velocity, close), -velocity, close)
   np.testing.assert_allclose(moved["native"].qpos, moved["mjx"].qpos, atol=2e-4)
   plain = drawn.replace(fields={}, command=None)
@@ -282,8 +300,7 @@ def _episodes(env: Env):
   play = jax.jit(
     lambda rows, key: rollout(
       env, expert_policy(env, noise=0.1), env.reset(rows), key, length=9
-    ),
-    compiler_options=testing.FAST_COMPILE,
+    )
   )
   return play(jnp.arange(4), jax.random.key(0))
 
@@ -319,7 +336,7 @@ def test_each_episode_has_its_own_world(plain_env):
     dataclasses.replace(CONFIG, randomize=True), plain_env.task, plain_env._bank
   )
 
-  @functools.partial(jax.jit, compiler_options=testing.FAST_COMPILE)
+  @jax.jit
   def play(rows, key):
     def period(state, key):
       action = env.expert_action(state)

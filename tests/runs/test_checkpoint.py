@@ -255,6 +255,18 @@ def test_items_are_read_one_by_one_and_older_ones_fill_in(tmp_path: Path):
   assert found.items.keys() == {"small"} and found.steps == {"small": 2}
 
 
+def test_every_kept_checkpoint_keeps_the_older_one_that_fills_it_in(tmp_path: Path):
+  with CheckpointWriter(tmp_path, CONFIG, keep=2) as writer:
+    for step in (1, 2, 3, 4, 5):
+      large = {"large": _state(10 * step)} if step in (2, 5) else {}
+      writer.save(step, {"small": _state(step)} | large)
+  # 5 holds everything, but 4 lacks what 2 holds.
+  assert checkpoint_reader.all_steps(tmp_path) == [2, 4, 5]
+  examples = {"small": _state(), "large": _state()}
+  found = checkpoint_reader.restore(tmp_path, 4, examples)
+  _assert_same_bits(found.items, {"small": _state(4), "large": _state(20)})
+
+
 def _files(folder: Path) -> list[Path]:
   return sorted(path for path in folder.rglob("*") if path.is_file())
 

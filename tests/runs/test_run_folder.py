@@ -30,7 +30,7 @@ def test_a_new_run_is_opened_with_the_same_configuration(tmp_path: Path):
 
 def test_versions_tell_what_the_run_was_made_with(tmp_path: Path):
   folder = run_folder.create(tmp_path / "run", CONFIG)
-  versions = json.loads(folder.versions.read_text())
+  versions = json.loads((folder.path / "versions.json").read_text())
   assert versions["python"] == platform.python_version()
   assert versions["packages"]["jax"] == jax.__version__
   assert versions["device"]["backend"] == jax.default_backend()
@@ -63,14 +63,20 @@ def test_git_commit_is_that_of_the_package_and_of_nobody_else(tmp_path: Path):
 
 def test_changed_versions_are_listed(tmp_path: Path):
   folder = run_folder.create(tmp_path / "run", CONFIG)
-  assert changed_versions(folder.versions) == []
-  versions = json.loads(folder.versions.read_text())
+  assert changed_versions(folder.path) == []
+  versions = json.loads((folder.path / "versions.json").read_text())
   versions["packages"]["jax"] = "0.0.1"
   versions["created"] = "long ago"
-  folder.versions.write_text(json.dumps(versions))
-  assert changed_versions(folder.versions) == [f"jax 0.0.1 -> {jax.__version__}"]
-  folder.versions.write_text("{")
-  assert changed_versions(folder.versions) == ["versions.json cannot be read"]
+  (folder.path / "versions.json").write_text(json.dumps(versions))
+  assert changed_versions(folder.path) == [f"jax 0.0.1 -> {jax.__version__}"]
+  (folder.path / "versions.json").write_text("{")
+  assert changed_versions(folder.path) == ["versions.json cannot be read"]
+
+
+def test_another_number_of_devices_is_a_changed_version(tmp_path: Path):
+  folder = run_folder.create(tmp_path / "run", CONFIG, devices=2)
+  assert changed_versions(folder.path, devices=2) == []
+  assert changed_versions(folder.path, devices=4) == ["count 2 -> 4"]
 
 
 def test_a_run_is_replaced_only_when_asked(tmp_path: Path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+import resource
 import subprocess
 import sys
 
@@ -12,7 +13,7 @@ import pytest
 
 from apnpql_jax.config.files import config_to_json
 from apnpql_jax.config.schema import AgentConfig, TrainConfig
-from apnpql_jax.errors import ConfigError, UserError
+from apnpql_jax.errors import UserError
 from apnpql_jax.runs import run_folder
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -123,49 +124,56 @@ def test_only_a_run_can_be_overwritten(tmp_path):
       run_folder.check_free(folder, overwrite=True)
 
 
-def test_fresh_folder_replaces_the_old_run(tmp_path):
+def test_new_run_replaces_the_old_one(tmp_path):
   run = write_run(tmp_path / "run")
-  with run_folder.fresh_run_dir(run) as folder:
-    assert folder == run
-    assert list(folder.iterdir()) == []
-    (folder / "config.json").write_text("new")
+  run_folder.create(run, TrainConfig(seed=4), overwrite=True)
   assert [path.name for path in tmp_path.iterdir()] == ["run"]
-  assert [path.name for path in run.iterdir()] == ["config.json"]
+  assert {path.name for path in run.iterdir()} == {"config.json", "versions.json"}
+  assert run_folder.load_run_config(run) == TrainConfig(seed=4)
 
 
 @pytest.mark.parametrize("existed", [False, True])
-@pytest.mark.parametrize(
-  ("error", "begun"), [(ConfigError, False), (ConfigError, True), (RuntimeError, False)]
-)
-def test_refused_run_leaves_everything_as_it_was(tmp_path, error, begun, existed):
+def test_run_that_cannot_be_written_leaves_everything_as_it_was(tmp_path, existed):
   run = tmp_path / "run"
   if existed:
     write_run(run)
-  with pytest.raises(error), run_folder.fresh_run_dir(run) as folder:
-    (folder / "scene.bin").write_bytes(b"new")
-    if begun:
-      (folder / "config.json").write_text("new")
-    raise error("no such camera")
+  soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+  resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 10, hard))  # As on a full disk.
+  try:
+    with pytest.raises(UserError, match="cannot make run folder .*large"):
+      run_folder.create(run, TrainConfig(seed=4), overwrite=True)
+  finally:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
   assert [path.name for path in tmp_path.iterdir()] == (["run"] if existed else [])
   if existed:
     assert (run / "curve.png").read_bytes() == b"old"
-    assert not (run / "scene.bin").exists()
+    assert run_folder.load_run_config(run) == TrainConfig()
 
 
-@pytest.mark.parametrize("stop", [KeyboardInterrupt, SystemExit, RuntimeError])
-def test_stopped_run_is_kept_and_the_old_one_removed(tmp_path, stop):
+KILLED = """
+import os, pathlib, sys
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.runs import run_folder
+
+def end(event, args):
+  moved = event == "os.rename" and str(args[0]) == sys.argv[1]
+  if moved or event == "shutil.rmtree":
+    os._exit(9)
+
+sys.addaudithook(end)
+run_folder.create(pathlib.Path(sys.argv[1]), TrainConfig(seed=4), overwrite=True)
+"""
+
+
+def test_process_killed_before_it_replaces_a_run_leaves_that_run_intact(tmp_path):
   run = write_run(tmp_path / "run")
-  with pytest.raises(stop), run_folder.fresh_run_dir(run) as folder:
-    (folder / "config.json").write_text("new")
-    raise stop()
-  assert [path.name for path in tmp_path.iterdir()] == ["run"]
-  assert (run / "config.json").read_text() == "new"
+  command = [sys.executable, "-c", KILLED, str(run)]
+  assert subprocess.run(command, cwd=ROOT, timeout=60).returncode == 9
+  assert (run / "curve.png").read_bytes() == b"old"
+  assert run_folder.load_run_config(run) == TrainConfig()
 
 
 def test_folder_that_cannot_be_made_is_refused(tmp_path):
   (tmp_path / "file").write_text("")
-  with (
-    pytest.raises(UserError, match="cannot make run folder"),
-    run_folder.fresh_run_dir(tmp_path / "file" / "run"),
-  ):
-    pass
+  with pytest.raises(UserError, match="cannot make run folder"):
+    run_folder.create(tmp_path / "file" / "run", TrainConfig())

@@ -70,7 +70,7 @@ def built(request) -> Built:
   state = initial_state(config, env, agent, collect_expert)
   assert all(x.committed for x in jax.tree.leaves(state))
   jitted: Any = make_iteration(config, env, agent)
-  iteration = jitted.lower(state).compile(compiler_options=testing.FAST_COMPILE)
+  iteration = jitted.lower(state).compile()
   for _ in range(3):
     state, metrics = iteration(state)
   assert metrics["faults/worlds"] == metrics["faults/updates"] == 0
@@ -296,14 +296,14 @@ def test_a_non_finite_update_is_skipped_and_counted(iteration, state, poison):
 def test_after_several_skipped_updates_the_run_stops_and_they_can_be_repeated(
   built, iteration, state, tmp_path: Path, capsys
 ):
-  folder = run_folder.create(tmp_path / "run", built.config)
-  faults.check(built.config, state, folder)
-  assert not folder.faults.exists()
+  run = run_folder.create(tmp_path / "run", built.config).path
+  faults.check(built.config, state, run)
+  assert not (run / "faults").exists()
   after, _ = iteration(_poison_replay(state))
   with pytest.raises(errors.RunStopped, match="2 updates in a row") as stop:
-    faults.check(built.config, after, folder)
+    faults.check(built.config, after, run)
   assert stop.value.code == errors.FAILED
-  (file,) = folder.faults.iterdir()
+  (file,) = (run / "faults").iterdir()
   # The message ends with a command that works verbatim.
   command = str(stop.value).rpartition("apnpql ")[2].split()
   capsys.readouterr()

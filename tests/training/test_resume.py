@@ -17,7 +17,10 @@ import numpy as np
 import pytest
 
 from apnpql_jax import testing
+from apnpql_jax.data import demonstrations
+from apnpql_jax.primitives.reset_bank import load_bank
 from apnpql_jax.runs import checkpoint_reader
+from apnpql_jax.tasks import make_task
 
 PATIENCE_S = 900
 FOR_EVER = ("--total-steps", "100000")
@@ -35,6 +38,25 @@ def _finish(process: subprocess.Popen[bytes], said: Path) -> None:
   assert process.wait(PATIENCE_S) == 0, said.read_text()[-2000:]
 
 
+def _write_demonstrations(path: Path) -> None:
+  """Writes four episodes of four time steps, in which the arm holds still."""
+  env = testing.TINY.env
+  task = make_task(env.task)
+  bank, _ = load_bank(task, env.bank_rows)
+  rows = np.arange(16) // 4
+  still = demonstrations.Demonstrations(
+    qpos=np.asarray(bank.qpos)[rows],
+    qvel=np.zeros((16, task.scene.model.nv), np.float32),
+    mocap_pos=np.asarray(bank.mocap_pos)[rows],
+    mocap_quat=np.asarray(bank.mocap_quat)[rows],
+    variant=np.asarray(bank.variant)[rows],
+    action=np.zeros((16, 7), np.float32),
+    first=np.arange(16) % 4 == 0,
+  )
+  period_s = env.control_period_s
+  demonstrations.save(path, still, task=env.task, control_period_s=period_s)
+
+
 @pytest.mark.parametrize(
   "kills", [2, pytest.param(20, marks=pytest.mark.slow, id="20")]
 )
@@ -42,7 +64,7 @@ def test_a_run_killed_at_random_times_ends_like_an_undisturbed_one(tmp_path, kil
   rng, said, run = np.random.default_rng(kills), tmp_path / "said", tmp_path / "run"
   demos, same = tmp_path / "demos.npz", tmp_path / "same.npz"
   for path in (demos, same):
-    testing.write_demonstrations(path)
+    _write_demonstrations(path)
 
   # During compilation there is nothing to save, so a signal ends the process at once.
   process = testing.start(

@@ -47,18 +47,18 @@ def test_a_run_writes_all_its_files(finished):
   run_dir, summary = finished
   assert summary["env_steps"] == 64 and summary["updates"] == 8
   assert summary["episodes"] == 4
-  folder = run_folder.open_run(run_dir)
-  assert folder.config == CONFIG
-  versions = json.loads(folder.versions.read_text())
+  assert run_folder.open_run(run_dir).config == CONFIG
+  versions = json.loads((run_dir / "versions.json").read_text())
   assert versions["packages"]["mujoco"] == "3.17.0"
-  rows = [json.loads(line) for line in folder.metrics_jsonl.read_text().splitlines()]
+  lines = (run_dir / "metrics.jsonl").read_text().splitlines()
+  rows = [json.loads(line) for line in lines]
   assert [row["step"] for row in rows if "loss/q" in row] == [16, 32, 48, 64]
   assert [row["step"] for row in rows if "eval/success_rate" in row] == [32, 64]
   losses = [row["loss/q"] for row in rows if "loss/q" in row]
   assert np.isfinite(losses).all()
   assert checkpoint_reader.all_steps(run_dir) == [32, 64]
-  assert iio.imread(folder.curve).shape[-1] in (3, 4)
-  (video,) = folder.videos.iterdir()
+  assert iio.imread(run_dir / "curve.png").shape[-1] in (3, 4)
+  (video,) = (run_dir / "videos").iterdir()
   frames = iio.imread(video, plugin="pyav")
   # Both cameras are next to the larger view, and something moves.
   assert frames.shape[0] > 10 and frames.shape[2] > 1.5 * frames.shape[1]
@@ -84,7 +84,7 @@ def test_resume_continues_the_run(finished):
   longer = dataclasses.replace(CONFIG, total_steps=96, video=False)
   summary = train(longer, run_dir, resume=True)
   assert summary["env_steps"] == 96 and summary["updates"] == 12
-  rows = run_folder.open_run(run_dir).metrics_jsonl.read_text().splitlines()
+  rows = (run_dir / "metrics.jsonl").read_text().splitlines()
   steps = [json.loads(row)["step"] for row in rows if "loss/q" in row]
   assert steps == [16, 32, 48, 64, 80, 96]
 

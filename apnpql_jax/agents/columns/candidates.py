@@ -31,16 +31,12 @@ class Candidates(struct.PyTreeNode):
   @property
   def entropy(self) -> Float[Array, "*b"]:
     """Estimate of the policy's entropy in nats."""
-    surprise = -self.log_prob(self.samples, self.q_values)
-    return jnp.sum(self.weights * surprise, axis=0)
+    return jnp.sum(self.weights * -self.log_prob(self.samples, self.q_values), axis=0)
 
   def log_prob(
     self, actions: Float[Array, " t *b 7"], q_values: Float[Array, " t *b"]
   ) -> Float[Array, " t *b"]:
-    """Computes the log density of actions of the given values.
-
-    For q this is an estimate: log b + Q / alpha - log mean_i exp(Q_i / alpha).
-    """
+    """Returns log densities; for q, log b + Q / alpha - log mean_i exp(Q_i / alpha)."""
     tilt = self.tilt[None]
     log_sum = jax.nn.logsumexp(tilt * self.q_values, axis=0, keepdims=True)
     log_mean = log_sum - math.log(self.q_values.shape[0])

@@ -1,4 +1,8 @@
-"""Policies as weighted candidate actions (Table I, column "policy")."""
+"""Policies as weighted candidate actions (Table I, column "policy").
+
+Each takes the heads at a batch of states, the regularizer b at the same states, a key
+and the number S of candidates. If ``greedy``, all weight is on the best candidate.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +16,9 @@ from apnpql_jax.dists.action import ActionDistribution
 from apnpql_jax.dists.gmm import GripperGMM
 from apnpql_jax.types import ARM_DOF, Array
 
-CEM_ITERATIONS = 2
-CEM_SAMPLES = 64
-CEM_ELITES = 6
-"""Settings of the cross-entropy method, as in QT-Opt (Kalashnikov 2018)."""
-
-CEM_MIN_STD = 0.01
-"""Floor of the elites' standard deviation, rad/s, so that the next draws differ."""
+# Settings of the cross-entropy method, as in QT-Opt (Kalashnikov 2018).
+CEM_ITERATIONS, CEM_SAMPLES, CEM_ELITES = 2, 64, 6
+CEM_MIN_STD = 0.01  # rad/s; floor of the elites' deviation, to keep draws apart
 
 
 def non_parametric(
@@ -31,23 +31,14 @@ def non_parametric(
 ) -> Candidates:
   """Samples q = b exp(Q / alpha) / Z by self-normalized importance sampling (Eq. 6).
 
-  Args:
-    heads: the networks at the states.
-    prior: the regularizer b at the same states.
-    key: random key.
-    num_samples: candidates S per state.
-    greedy: put all weight on the candidate with the highest value.
-
-  Returns:
-    Candidates drawn from ``prior`` with weights softmax(Q / alpha), without gradient.
+  Candidates are drawn from b and have weights softmax(Q / alpha), without gradient.
   """
   heads, prior = heads.frozen(), jax.lax.stop_gradient(prior)
   samples = prior.sample(seed=key, sample_shape=num_samples)
   actions, outputs, q_values = _evaluate(heads, samples)
   alpha = heads.alpha()
   weights = boltzmann.importance_weights(q_values, alpha)
-  if greedy:
-    weights = _all_on_the_highest(q_values)
+  weights = _all_on_the_highest(q_values) if greedy else weights
   return Candidates(samples, actions, outputs, q_values, weights, prior, 1.0 / alpha)
 
 
@@ -62,16 +53,9 @@ def parametric(
   """Samples the arm from pi_psi and pairs each draw with both gripper commands.
 
   The two candidates of a draw share its weight in proportion to their density under
-  pi, so the sum over the gripper is exact. Gradients reach only psi, through draws and
-  weights.
-
-  Args:
-    heads: the networks at the states.
-    prior: unused.
-    key: random key.
-    num_samples: candidates S per state, rounded down to an even number.
-    greedy: use the mean instead of draws and put all weight on the likelier gripper
-      command.
+  pi, so the sum over the gripper is exact. S is rounded down to an even number.
+  Gradients reach only psi, through draws and weights. If greedy, the mean replaces the
+  draws and has all weight on its likelier gripper command.
   """
   del prior
   policy = heads.policy()
@@ -83,8 +67,7 @@ def parametric(
   actions, outputs, q_values = _evaluate(heads.frozen(), samples)
   log_prob = policy.log_prob(samples).reshape(both.shape[:-1])
   weights = jax.nn.softmax(log_prob, axis=0).reshape(q_values.shape) / drawn.shape[0]
-  if greedy:
-    weights = _all_on_the_highest(weights)
+  weights = _all_on_the_highest(weights) if greedy else weights
   tilt = jnp.zeros(q_values.shape[1:])
   return Candidates(samples, actions, outputs, q_values, weights, policy, tilt)
 
@@ -99,15 +82,7 @@ def cem(
 ) -> Candidates:
   """Finds the best action by the cross-entropy method (QT-Opt), starting from b.
 
-  Args:
-    heads: the networks at the states.
-    prior: the regularizer b, the source of the first draw.
-    key: random key.
-    num_samples: unused; the method draws ``CEM_SAMPLES``.
-    greedy: unused; the method is greedy.
-
-  Returns:
-    The last draw with all weight on its best action, without gradient.
+  All weight is on the best action of the last draw, without gradient.
   """
   del num_samples, greedy
   heads, base = heads.frozen(), jax.lax.stop_gradient(prior)
@@ -130,7 +105,7 @@ def _evaluate(heads: Heads, samples: Array) -> tuple[Array, Array, Array]:
 
 
 def _all_on_the_highest(x: Array) -> Array:
-  """Returns weights f32[S, *b] that select the highest of f32[S, *b]."""
+  """Returns weights that select the highest of [S, *b] over S."""
   return jax.nn.one_hot(jnp.argmax(x, axis=0), x.shape[0], axis=0, dtype=x.dtype)
 
 

@@ -1,7 +1,7 @@
 """Policy evaluation (Table I, last column): the value head and its target.
 
-Every target estimates E_pi of the return, without entropy (paper Sec. V-B), from the
-N-step transition of the replay. TD(0) proper is therefore ``n_step`` = 1.
+Every target estimates the N-step return under pi, without entropy (paper Sec. V-B).
+TD(0) proper is therefore ``n_step`` = 1.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.dists import categorical
 from apnpql_jax.types import Array, Observation, Transition
 
+# (states) -> the target network's heads and policy there.
 TargetPolicy = Callable[[Observation], tuple[Heads, Candidates]]
-"""Evaluates the target network's heads and its policy at given states."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,9 +34,7 @@ class Evaluation(abc.ABC):
   """How values are represented and learned."""
 
   config: AgentConfig
-
-  windows: ClassVar[bool] = False
-  """True if the target needs all N instants of a transition (``Transition.window``)."""
+  windows: ClassVar[bool] = False  # whether the target needs ``Transition.window``
 
   @abc.abstractmethod
   def head(self, hidden: Sequence[int]) -> nn.Module:
@@ -113,8 +111,7 @@ class TD0(Evaluation):
   def target(self, policy_at: TargetPolicy, batch: Transition) -> Array:
     """Bootstraps from the policy's value at s'."""
     _, policy = policy_at(batch.observation_t)
-    target = batch.reward_t + batch.discount_t * policy.value
-    return jax.lax.stop_gradient(target)
+    return jax.lax.stop_gradient(batch.reward_t + batch.discount_t * policy.value)
 
   def loss(self, outputs: Array, target: Array) -> Array:
     """Computes half the squared error, summed over outputs."""

@@ -39,30 +39,24 @@ def none(heads: Heads, prior: ActionDistribution, key: Array) -> Improvement:
 
 
 def forward_kl(heads: Heads, prior: ActionDistribution, key: Array) -> Improvement:
-  """Minimizes KL(q || pi_psi) by weighted maximum likelihood (MPO, moment matching).
-
-  The candidates are those of q, drawn from the regularizer.
-  """
+  """Minimizes KL(q || pi_psi) by weighted maximum likelihood (MPO, moment matching)."""
   step = none(heads, prior, key)
   q, policy = step.candidates, heads.policy()
   fit = losses.weighted_nll(policy, q.samples, q.weights)
-  return step.replace(
-    entropy=policy.entropy_bound(), losses={**step.losses, "loss/policy": fit}
-  )
+  terms = {**step.losses, "loss/policy": fit}
+  return step.replace(entropy=policy.entropy_bound(), losses=terms)
 
 
 def reverse_kl(heads: Heads, prior: ActionDistribution, key: Array) -> Improvement:
   """Minimizes KL(pi_psi || q) through alpha KL(pi || b) - E_pi[Q] (SAC, mode seeking).
 
-  The arm is reparameterized and the gripper summed over. The dual of the limit
-  KL(pi || b) <= epsilon is alpha (epsilon - KL). With a uniform b the limit is a floor
-  on the entropy: H(pi) >= log volume - epsilon.
+  The arm is reparameterized and the gripper summed over. With a uniform b the limit
+  KL(pi || b) <= epsilon is a floor on the entropy: H(pi) >= log volume - epsilon.
   """
   config = heads.config
   pi = parametric(heads, prior, key, num_samples=config.policy_samples)
-  log_ratio = pi.base.log_prob(pi.samples) - jax.lax.stop_gradient(prior).log_prob(
-    pi.samples
-  )
+  log_pi = pi.base.log_prob(pi.samples)
+  log_ratio = log_pi - jax.lax.stop_gradient(prior).log_prob(pi.samples)
   kl = jnp.sum(pi.weights * log_ratio, axis=0)
   alpha = heads.alpha()
   terms = {

@@ -62,14 +62,10 @@ def fit_advantageous(
   key: PRNGKeyArray,
   nu: Float[Array, ""],
 ) -> Losses:
-  """Fits b to good replayed actions (ABM, Siegel 2020): max 1[A >= 0] log b(a).
-
-  The advantage is A = Q(s, a) - E_pi[Q(s, .)].
-  """
+  """Fits b to replayed actions with Q(s, a) >= E_pi[Q(s, .)] (ABM, Siegel 2020)."""
   del candidates
   samples = batch.action_tm1[None]
-  # Not the draws that the policy update takes with this key.
-  key = jax.random.fold_in(key, 1)
+  key = jax.random.fold_in(key, 1)  # Other draws than those of the policy update.
   policy = parametric(heads, prior, key, num_samples=heads.config.policy_samples)
   good = heads.q(samples) >= policy.value[None]
   return _fit(heads, prior, samples, good.astype(samples.dtype), nu)
@@ -83,9 +79,8 @@ def _fit(
   nu: Float[Array, ""],
 ) -> Losses:
   """Returns the M-step's loss and the dual of the entropy floor."""
+  floor = heads.config.epsilon_nu
   return {
     "loss/m": losses.m_step_loss(prior, samples, weights, nu),
-    "loss/nu": losses.nu_loss(
-      nu, prior.entropy_bound(), epsilon_nu=heads.config.epsilon_nu
-    ),
+    "loss/nu": losses.nu_loss(nu, prior.entropy_bound(), epsilon_nu=floor),
   }
