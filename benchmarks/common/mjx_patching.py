@@ -9,12 +9,7 @@ from apnpql_jax.sim import mjx_patches
 
 @contextlib.contextmanager
 def patched(*, barrier: bool, cones: bool) -> Generator[None]:
-  """Traces MJX inside with the chosen patches and no others.
-
-  Args:
-    barrier: a barrier behind each body of a kinematic chain.
-    cones: Hessians of elliptic cones in blocks.
-  """
+  """Traces MJX inside with these patches: barriers behind bodies, cones in blocks."""
   scan, solver = mjx_patches._scan, mjx_patches._solver
   body_tree = "_guarded_body_tree" if barrier else "_stock_body_tree"
   gradient = "_update_gradient" if cones else "_stock_update_gradient"

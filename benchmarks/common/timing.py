@@ -111,13 +111,7 @@ def measure(
 ) -> dict[Key, Times]:
   """Times programs in turns, after two calls of each that do not count.
 
-  Args:
-    ready: the programs.
-    repeats: how often each is timed.
-    seconds: least duration of a repeat.
-
-  Returns:
-    the times of one unit of each program's work.
+  A repeat takes at least so many ``seconds``. Returns the times of a unit of work.
   """
   calls: dict[Key, int] = {}
   taken: dict[Key, list[tuple[float, float]]] = {key: [] for key in ready}

@@ -72,13 +72,7 @@ class Suite:
   """Sections at work, and their common report."""
 
   def __init__(self, out: Path, folder: str, deadline: float):
-    """Starts an empty report.
-
-    Args:
-      out: file of the report.
-      folder: for the locks of ``turns``.
-      deadline: of all sections, by the monotonic clock, s.
-    """
+    """Starts a report in ``out``; ``turns`` locks files in ``folder``."""
     self.report: dict[str, Any] = {"commit": store.commit(), "sections": {}}
     self._out, self._deadline, self._lock = out, deadline, threading.Lock()
     self._env = os.environ | {"PYTHONPATH": str(store.ROOT), turns.FOLDER: folder}

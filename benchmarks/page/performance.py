@@ -34,6 +34,7 @@ BLOCKS = (
 PANELS = 3  # panels of a plot side by side
 
 NATIVE = {"backend": "native", "obs": "pixels", "worlds": 32}
+MJX = NATIVE | {"backend": "mjx"}
 TRAIN, START = NATIVE | {"task": "push_plate"}, {"backend": "native"}
 UPDATE = {"batch": 64, "candidates": 120, "phi": "once"}
 IMAGES = {"renderer": "ray_caster", "resolution": "paper", "shadow": False}
@@ -41,10 +42,7 @@ PEER = {"peer": PEERS["pybullet"].label, "rate": RATES["cameras"]}
 ANSWER: tuple[tuple[str, str, str, dict[str, Any]], ...] = (
   ("environment steps/s, C MuJoCo", "250 (800)", "env_steps.env.steps_per_s", NATIVE),
   ("the same as a ratio to PyBullet, 64 worlds", "3 (10)", "peers.ratio", PEER),
-  (
-    *("environment steps/s, MJX", "60 (150)", "env_steps.env.steps_per_s"),
-    NATIVE | {"backend": "mjx"},
-  ),
+  ("environment steps/s, MJX", "60 (150)", "env_steps.env.steps_per_s", MJX),
   ("updates/s, batch 64, 120 candidates", "15 (30)", "learner.updates_per_s", UPDATE),
   ("steps/s while training on push_plate", "", "end_to_end.steps_per_s", TRAIN),
   ("updates/s while training on push_plate", "", "end_to_end.updates_per_s", TRAIN),
@@ -125,7 +123,7 @@ def plot_growth(report: Report, out: Path) -> None:
       floors = [point["floor_s"] for point in points]
       panel.loglog(sizes, floors, ":", color=line.get_color(), linewidth=0.8)
     _mark(panel, sizes)
-    panel.set_xlabel(reports.UNITS[axis])
+    panel.set_xlabel(reports.UNITS.get(axis, axis))
     panel.legend()
   for panel in panels[:, 0]:
     panel.set_ylabel("s")

@@ -19,13 +19,11 @@ MODULES = {"fidelity": "quality.fidelity", "peers": "peers.compare"}
 """Modules of benchmarks outside ``benchmarks.speed``."""
 
 UNITS = {
-  "worlds": "worlds",
-  "candidates": "candidates",
   "pixels": "pixels of a pair of images",
   "slots": "slots of the replay",
   "contacts": "contact slots",
 }
-"""Axis of growth -> unit of its sizes."""
+"""Axis of growth -> unit of its sizes, where the names differ."""
 
 COLUMNS = {
   "fidelity": "scene|camera|equal pixels=agreeing:%|mean IoU=iou_mean:.3f"
@@ -200,7 +198,7 @@ def growth(report: Report) -> Prepared:
   """Makes a table for each axis, with the exponent of growth since the last size."""
   found = []
   for axis, series in curves(report).items():
-    head, rows = [UNITS[axis]], {}
+    head, rows = [UNITS.get(axis, axis)], {}
     for name, points in series.items():
       head += [f"{name}, ms", "exponent", "reached"]
       for last, point in zip([None, *points], points, strict=False):

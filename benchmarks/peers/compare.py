@@ -11,13 +11,12 @@ are reported as missing.
 
 import argparse
 from collections.abc import Iterator, Sequence
-import dataclasses
 import os
 from pathlib import Path
 import subprocess
 import sys
 import tempfile
-from typing import Any
+from typing import Any, NamedTuple
 
 from apnpql_jax import runtime
 from apnpql_jax.config.files import preset_names
@@ -35,19 +34,15 @@ SIZES = ("task", "preset", "processes", "worlds", "batch", "candidates")
 """Flags that both sides get as settings."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Peer:
+class Peer(NamedTuple):
   """The two sides of a comparison."""
 
   label: str  # name and set-up, for the table
   module: str  # the peer's side
   rates: tuple[str, ...]  # keys of ``RATES``
-  ours: dict[str, Any]  # settings of our side, see ``ours.py``
-  settings: dict[str, Any] = dataclasses.field(default_factory=dict)
-  """Settings of the peer's side in addition to those of the command line."""
-
-  one_each: bool = False
-  """Whether each of its worlds is a process of its own."""
+  ours: Result  # settings of our side in addition to the flags, see ``ours.py``
+  settings: Result  # settings of the peer's side in addition to the flags
+  one_each: bool = False  # whether each of its worlds is a process of its own
 
 
 _STEPS = ("cameras", "physics")
@@ -59,13 +54,11 @@ PEERS = {
   "pybullet": Peer(
     "PyBullet with TinyRenderer, the paper's set-up: free-running processes, velocity "
     "motors, 1/240 s",
-    *("pybullet_worlds", _STEPS, _WORLDS),
-    one_each=True,
+    *("pybullet_worlds", _STEPS, _WORLDS, {}, True),
   ),
   "mujoco": Peer(
     "MuJoCo and its renderer: free-running processes, our control law in Python",
-    *("mujoco_worlds", _STEPS, _WORLDS, {"gymnasium": False}),
-    one_each=True,
+    *("mujoco_worlds", _STEPS, _WORLDS, {"gymnasium": False}, True),
   ),
   "gymnasium": Peer(
     "the same worlds in Gymnasium's AsyncVectorEnv",
@@ -78,7 +71,7 @@ PEERS = {
   ),
   "torch": Peer(
     "the same learner in plain PyTorch: eager mode, Adam, library distributions",
-    *("torch_learner", ("updates",), {"side": "learner"}),
+    *("torch_learner", ("updates",), {"side": "learner"}, {}),
   ),
 }
 

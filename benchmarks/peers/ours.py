@@ -34,9 +34,7 @@ def build(settings: sides.Settings) -> sides.Built:
 
 def worlds(settings: sides.Settings) -> dict[str, sides.Measure]:
   """Returns measures of control steps of all worlds: whole, or physics only."""
-  config = EnvConfig(
-    task=settings["task"], backend=settings["backend"], worlds=settings["worlds"]
-  )
+  config = EnvConfig(**{name: settings[name] for name in ("task", "backend", "worlds")})
   periods = settings["periods"]  # Per call.
   env = make_env(config)
   start = env.reset(jnp.arange(config.worlds) % env.bank_split)

@@ -53,17 +53,10 @@ class Side(contextlib.AbstractContextManager):
   def __init__(
     self, module: str, settings: Settings, *, count: int = 1, limit_s: float, **env: str
   ):
-    """Starts the processes and waits until they are ready.
+    """Starts ``count`` processes of a module of this folder and waits for them.
 
-    Args:
-      module: of this folder.
-      settings: what to build; each process also gets its number as "seed".
-      count: processes, whose rates are added up.
-      limit_s: longest time to become ready, and for each answer, s.
-      **env: environment variables in addition to those of this process.
-
-    Raises:
-      SideFailed: a process ended or stayed silent.
+    Each gets the settings with its number as "seed", and the variables ``env``. Their
+    rates are added up. Raises ``SideFailed`` if one ends, or is silent for ``limit_s``.
     """
     self._limit_s, self._errors = limit_s, tempfile.TemporaryFile("w+")
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])

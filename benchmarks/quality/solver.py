@@ -51,8 +51,7 @@ def measure(name: str, backend: str, setting: str, episodes: int) -> dict[str, f
   bank, _ = load_bank(task, config.bank_rows)  # The same resets for all settings.
   model = task.scene.model
   iterations, ls_iterations, *contacts = map(int, setting.split("x"))
-  model.opt.iterations = iterations
-  model.opt.ls_iterations = ls_iterations
+  model.opt.iterations, model.opt.ls_iterations = iterations, ls_iterations
   model.numeric("mjx_ls_iterations").data[:] = ls_iterations
   if contacts:
     model.numeric("max_contact_points").data[:] = contacts

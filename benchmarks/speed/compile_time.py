@@ -90,10 +90,9 @@ def training(args: list[str], run: Path, **env: str) -> Generator[float]:
   """
   command = [sys.executable, "-m", "apnpql_jax", "train", *args, "--run", str(run)]
   output, began = run.with_suffix(".txt"), time.monotonic()
+  env = environment() | env
   with output.open("wb") as file:
-    process = subprocess.Popen(
-      command, env=environment() | env, stdout=file, stderr=file
-    )
+    process = subprocess.Popen(command, env=env, stdout=file, stderr=file)
   try:
     while not testing.rows(run):
       if process.poll() is not None or time.monotonic() - began > PATIENCE_S:

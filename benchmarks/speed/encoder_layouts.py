@@ -8,7 +8,7 @@ the share of the images.
 """
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 from unittest import mock
 
@@ -40,19 +40,19 @@ def main() -> None:
 
 def measure_all(config: TrainConfig, args: argparse.Namespace) -> Iterator[Result]:
   """Yields the figures of every layout, timed in turns."""
-  ready = {name: LAYOUTS[name](config) for name in args.layouts}
+  ready = {name: prepare(config, *LAYOUTS[name]) for name in args.layouts}
   found = timing.figures("update", ready, repeats=args.repeats)
   for name, figures in found.items():
     yield {"layout": name, **figures}
 
 
 def prepare(
-  config: TrainConfig, agent: Result, parts: Result | None = None, obs: str = "pixels"
+  config: TrainConfig, obs: str, agent: Result, parts: Result
 ) -> timing.Ready:
   """Compiles updates with other settings of the agent and parts of ``encoder``."""
   config = settings.changed(config, "agent", **agent)
   config = settings.changed(config, "env", obs=obs)
-  patches: Result = {"PATCH": encoder.PATCH} | (parts or {})
+  patches: Result = {"PATCH": encoder.PATCH} | parts
   with mock.patch.multiple(encoder, **patches):
     return learner.prepare(make_agent(config.agent), noise.transitions(config))
 
@@ -77,16 +77,16 @@ _OVERLAP: Result = {"conv_overlap": True}
 _MAPS = {"global_features": "map", "wrist_features": "map"}
 _BLOCK, _XLA = {"residual_blocks": 1}, {"PixelEncoder": Convolutions}
 
-LAYOUTS: dict[str, Callable[[TrainConfig], timing.Ready]] = {
-  "none": lambda config: prepare(config, {}, obs="state"),
-  "4x4 / 4, 2x2 / 2": lambda config: prepare(config, _APART),
-  "4x4 / 4, 3x3 / 2": lambda config: prepare(config, _OVERLAP),
-  "4x4 / 4, 2x2 / 2 by XLA": lambda config: prepare(config, _APART, _XLA),
-  "4x4 / 4, 3x3 / 2 by XLA": lambda config: prepare(config, _OVERLAP, _XLA),
-  "2x2 / 2, 2x2 / 2": lambda config: prepare(config, _APART, {"PATCH": 2}),
-  "8x8 / 8, 2x2 / 2": lambda config: prepare(config, _APART, {"PATCH": 8}),
-  "4x4 / 4, 2x2 / 2, maps": lambda config: prepare(config, _APART | _MAPS),
-  "4x4 / 4, 2x2 / 2, residual block": lambda config: prepare(config, _APART | _BLOCK),
+LAYOUTS: dict[str, tuple[str, Result, Result]] = {
+  "none": ("state", {}, {}),
+  "4x4 / 4, 2x2 / 2": ("pixels", _APART, {}),
+  "4x4 / 4, 3x3 / 2": ("pixels", _OVERLAP, {}),
+  "4x4 / 4, 2x2 / 2 by XLA": ("pixels", _APART, _XLA),
+  "4x4 / 4, 3x3 / 2 by XLA": ("pixels", _OVERLAP, _XLA),
+  "2x2 / 2, 2x2 / 2": ("pixels", _APART, {"PATCH": 2}),
+  "8x8 / 8, 2x2 / 2": ("pixels", _APART, {"PATCH": 8}),
+  "4x4 / 4, 2x2 / 2, maps": ("pixels", _APART | _MAPS, {}),
+  "4x4 / 4, 2x2 / 2, residual block": ("pixels", _APART | _BLOCK, {}),
 }
 """Kernel / stride of both layers, as matrix products unless "by XLA"."""
 

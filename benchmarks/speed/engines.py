@@ -26,7 +26,6 @@ from benchmarks.common import command, timing
 from benchmarks.common.mjx_patching import patched
 
 TASK = "push_plate"
-
 VARIANTS: dict[str, dict[str, Any]] = {
   "barrier and cones": {"barrier": True, "cones": True},
   "barrier": {"barrier": True, "cones": False},
@@ -55,9 +54,7 @@ def main() -> None:
   command.publish("engines", args, results, **header)
 
 
-def measure_all(
-  names: Sequence[str], args: argparse.Namespace
-) -> Iterator[dict[str, Any]]:
+def measure_all(names: Sequence[str], args: argparse.Namespace) -> Iterator[dict]:
   """Yields the figures of every variant, or why it does not run."""
   task = make_task(TASK)
   start = task.sample_resets(np.random.default_rng(0), args.worlds).qpos
@@ -78,9 +75,8 @@ def prepare(
   task: Task,
   start: np.ndarray,
   substeps: int,
-  *,
-  impl: str = "jax",
-  limited: bool = True,
+  impl="jax",
+  limited=True,
   **patches: bool,
 ) -> timing.Ready:
   """Compiles a period of all worlds, from rest at ``start`` to the final qpos.

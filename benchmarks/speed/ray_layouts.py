@@ -67,12 +67,7 @@ def agreeing(drawn: list[Array], expected: list[Array]) -> float:
 
 
 def prepare(
-  scene: Scene,
-  sizes: Sizes,
-  poses: Any,
-  still: bool = True,
-  options: Any = None,
-  **parts,
+  scene: Scene, sizes: Sizes, poses: Any, still=True, options: Any = None, **parts: Any
 ) -> tuple[Any, float]:
   """Compiles both images with other ``parts`` of ``raycast`` or ``options`` of XLA.
 
@@ -95,15 +90,7 @@ def without_still(scene: Scene) -> Scene:
   return dataclasses.replace(scene, model=model)
 
 
-def cast_by_type(
-  geoms: Geoms,
-  lighting: Any,
-  look: Any,
-  frames: Any,
-  basis: Array,
-  near: Any,
-  rays: Any,
-) -> Cast:
+def cast_by_type(geoms: Geoms, lighting, look, frames, basis, near, rays) -> Cast:
   """Casts all geoms of a type at once, then picks the nearest hit; no shadows."""
   ray_light = intersect.along(basis[2], rays)
 
