@@ -61,6 +61,14 @@ def test_import_changes_no_variable_and_starts_no_backend():
   assert run(code).splitlines()[-1] == "[] False"
 
 
+def test_no_import_prints_about_the_optional_warp():
+  """MJX prints when it is first imported, so only ``sim``, which hides that, may do so."""
+  modules = (ROOT / "apnpql_jax").rglob("*.py")
+  users = {p.parent.name for p in modules if "from mujoco import mjx" in p.read_text()}
+  assert users == {"sim"}
+  assert run("import apnpql_jax.envs.contact_report") == ""
+
+
 @pytest.mark.parametrize(
   ("given", "minimum"),
   [

@@ -77,25 +77,8 @@ def make_agent(config: AgentConfig) -> Agent:
   def act(
     params: Params, observation: Observation, key: PRNGKeyArray, greedy: bool = False
   ) -> tuple[Array, Metrics]:
-    # Draw candidates and pick one by its weight (paper Sec. III-B).
-    key_candidates, key_pick = jax.random.split(key)
     heads = networks.at(params, observation)
-    prior = algorithm.regularizer(heads, heads)
-    candidates = algorithm.policy(
-      heads, prior, key_candidates, num_samples=config.policy_samples, greedy=greedy
-    )
-    q_values, weights = candidates.q_values, candidates.weights
-    chosen = boltzmann.pick(key_pick, weights)
-    actions = jnp.take_along_axis(candidates.actions, chosen[None, :, None], axis=0)
-    q = jnp.take_along_axis(q_values, chosen[None], axis=0)
-    info = {
-      "q": q[0],
-      "q_max": jnp.max(q_values, axis=0),
-      "alpha": heads.alpha(),
-      "ess": boltzmann.effective_sample_size(weights),
-      "log_prob": candidates.log_prob(actions, q)[0],
-    }
-    return actions[0], info
+    return sample_action(algorithm, heads, key, greedy=greedy)
 
   def update(
     state: LearnerState, batch: Transition, key: PRNGKeyArray
@@ -155,6 +138,32 @@ def make_optimizer(
   step = {"encoder": "e_step", "ap": "e_step", "z": "e_step", "bp": "m_step"}
   labels = {group: step.get(group, group) for group in (*groups, "nu")}
   return optax.partition({k: adam(rates[k]) for k in labels.values()}, labels)
+
+
+def sample_action(
+  algorithm: Algorithm, heads: Heads, key: PRNGKeyArray, *, greedy: bool
+) -> tuple[Array, Metrics]:
+  """Draws candidates and picks one by weight (paper Sec. III-B), see ``Agent.act``."""
+  key_candidates, key_pick = jax.random.split(key)
+  candidates = algorithm.policy(
+    heads,
+    algorithm.regularizer(heads, heads),
+    key_candidates,
+    num_samples=heads.config.policy_samples,
+    greedy=greedy,
+  )
+  q_values, weights = candidates.q_values, candidates.weights
+  chosen = boltzmann.pick(key_pick, weights)
+  actions = jnp.take_along_axis(candidates.actions, chosen[None, :, None], axis=0)
+  q = jnp.take_along_axis(q_values, chosen[None], axis=0)
+  info = {
+    "q": q[0],
+    "q_max": jnp.max(q_values, axis=0),
+    "alpha": heads.alpha(),
+    "ess": boltzmann.effective_sample_size(weights),
+    "log_prob": candidates.log_prob(actions, q)[0],
+  }
+  return actions[0], info
 
 
 def bellman_target(

@@ -7,10 +7,10 @@ import time
 
 import jax
 import jax.numpy as jnp
-from mujoco import mjx
 import numpy as np
 
 from apnpql_jax.sim import engines, physics
+from apnpql_jax.sim.mjx import contact_slots
 from apnpql_jax.tasks import Task
 
 WORLDS = 64
@@ -27,8 +27,8 @@ def contact_report(
   whether anything touches or not; steps per second are summed over worlds.
   """
   scene, model = task.scene, task.scene.model
-  slots = mjx.make_data(model, impl="jax")._impl
-  report = dict(pairs=model.npair, contacts=slots.ncon, constraint_rows=int(slots.nefc))
+  contacts, rows = contact_slots(model)
+  report = dict(pairs=model.npair, contacts=contacts, constraint_rows=rows)
   draw = task.sample_resets(np.random.default_rng(0), WORLDS)
   start = physics.initial_state(scene, *map(jnp.asarray, draw))
   still, close = jnp.zeros((WORLDS, 6)), jnp.zeros(WORLDS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import mujoco
 from mujoco import mjx
 import numpy as np
 
@@ -79,3 +80,9 @@ class MjxPhysics:
     force = mjx.mul_m(model, data, data.qacc) - data.qfrc_smooth
     force = jnp.where(self._free, force, data.qfrc_constraint)
     return mjx.implicit(model, data.replace(qfrc_constraint=force))
+
+
+def contact_slots(model: mujoco.MjModel) -> tuple[int, int]:
+  """Returns the contact slots and constraint rows that MJX computes at every substep."""
+  slots = mjx.make_data(model, impl="jax")._impl
+  return slots.ncon, int(slots.nefc)
