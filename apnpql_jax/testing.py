@@ -23,7 +23,8 @@ from apnpql_jax.types import Observation, Slot, TimeStep, Transition
 ROOT = Path(__file__).resolve().parents[1]
 
 XLA_FLAGS = (
-  "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+  "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
+  "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 )
 """Value of the environment variable that makes compilation fast."""
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 import os
+from pathlib import Path
 
 from hand_made import WORLDS, drawn, neutral_tool
 import jax
@@ -25,6 +26,18 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ["XDG_CACHE_HOME"] = str(testing.ROOT / ".pytest_cache" / "home")
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {testing.XLA_FLAGS}"
 runtime.configure()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_programs() -> Iterator[None]:
+  """Frees compiled programs before Linux's 65,530 memory maps of a process run out.
+
+  A program takes hundreds of them; the one that finds none left crashes the process.
+  """
+  yield
+  maps = Path("/proc/self/maps")
+  if maps.exists() and len(maps.read_text().splitlines()) > 20_000:
+    jax.clear_caches()
 
 
 @pytest.fixture(scope="session")

@@ -62,7 +62,7 @@ def test_import_changes_no_variable_and_starts_no_backend():
 
 
 def test_no_import_prints_about_the_optional_warp():
-  """MJX prints when it is first imported, so only ``sim``, which hides that, may do so."""
+  """MJX prints when it is imported; only ``sim``, which hides that, may import it."""
   modules = (ROOT / "apnpql_jax").rglob("*.py")
   users = {p.parent.name for p in modules if "from mujoco import mjx" in p.read_text()}
   assert users == {"sim"}

@@ -83,6 +83,6 @@ class MjxPhysics:
 
 
 def contact_slots(model: mujoco.MjModel) -> tuple[int, int]:
-  """Returns the contact slots and constraint rows that MJX computes at every substep."""
+  """Returns the contact slots and constraint rows that MJX fills in every substep."""
   slots = mjx.make_data(model, impl="jax")._impl
   return slots.ncon, int(slots.nefc)

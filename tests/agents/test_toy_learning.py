@@ -215,7 +215,8 @@ def learn(config: AgentConfig, iterations: int, *, held: bool = False):
   key_begin, key_train, key_test = jax.random.split(jax.random.key(0), 3)
   carry = jax.jit(functools.partial(begin, agent, held=held))(key_begin)
 
-  @jax.jit
+  # Training takes longer than its compilation, unlike in the other tests.
+  @functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 1})
   def train(carry):
     body = functools.partial(train_step, agent)
     return jax.lax.scan(body, carry, jax.random.split(key_train, iterations))

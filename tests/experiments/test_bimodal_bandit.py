@@ -19,7 +19,7 @@ def played() -> dict[str, tuple[np.ndarray, float]]:
   found = {}
   for name in BANDIT["ALGORITHMS"]:
     config = dataclasses.replace(BANDIT["CONFIG"], algorithm=name)
-    actions = BANDIT["play"](config, updates=1000, draws=1000)
+    actions = BANDIT["play"](config, updates=500, draws=1000)
     peak = BANDIT["nearest"](actions)
     shares = np.array([np.mean(peak == i) for i in (0, 1)])
     found[name] = shares, float(BANDIT["reward"](actions).mean())
