@@ -76,7 +76,8 @@ class Train(_Command):
   """Short for --agent.algorithm; `apnpql list` shows all."""
 
   devices: int = 1
-  """Devices that share the worlds and batches; 0: all (always with --coordinator)."""
+  """Devices that share the worlds and batches, also with --resume, because a run does
+  not store it; 0: all (always with --coordinator)."""
 
   coordinator: str = ""
   """Address and port of the first of several processes, or auto to take it and the next
@@ -143,7 +144,7 @@ class Convert(_Command):
 
 @dataclasses.dataclass(frozen=True)
 class Repeat(_Command):
-  """Repeats an update that was not finite: apnpql repeat RUN/faults/step_<n>.npz."""
+  """Repeats an update with NaN or infinity: apnpql repeat RUN/faults/step_<n>.npz."""
 
   file: tyro.conf.Positional[str] = ""
   """File that a run wrote when it stopped, still in its run folder."""

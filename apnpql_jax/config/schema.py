@@ -228,8 +228,8 @@ class ReplayConfig:
   """File of demonstrations (docs/demonstrations.md) instead of the scripted expert."""
 
   expert_noise: float = 0.03
-  """Standard deviation of the noise on the expert's joint velocities (rad/s); at 0.1 it
-  rarely grasps."""
+  """Standard deviation of the noise on the expert's joint velocities (rad/s); at 0.1 the
+  expert rarely grasps."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -270,11 +270,11 @@ class TrainConfig:
   """Number of latest checkpoints to keep."""
 
   save_replay_every: int = 0
-  """Environment steps between checkpoints that include the replay; 0: all do. A run
-  resumed from one without continues with an older replay, so not bit for bit."""
+  """Environment steps between checkpoints that include the replay; 0: all do. From one
+  without it, a run resumes with an older replay and is not bit-exact."""
 
   max_skipped_updates: int = 100
-  """Consecutive updates skipped because they are not finite at which the run stops."""
+  """Updates skipped in a row for NaN or infinity after which the run stops."""
 
   video: bool = True
   """Write a video of evaluation episodes."""
