@@ -76,8 +76,8 @@ class Train(_Command):
   """Short for --agent.algorithm; `apnpql list` shows all."""
 
   devices: int = 1
-  """Devices that share the worlds and batches, also with --resume, because a run does
-  not store it; 0: all (always with --coordinator)."""
+  """Devices that share the worlds and batches; 0: all (always with --coordinator). Not
+  stored in the run: pass it again with --resume."""
 
   coordinator: str = ""
   """Address and port of the first of several processes, or auto to take it and the next

@@ -274,7 +274,7 @@ class TrainConfig:
   without it, a run resumes with an older replay and is not bit-exact."""
 
   max_skipped_updates: int = 100
-  """Updates skipped in a row for NaN or infinity after which the run stops."""
+  """The run stops after skipping this many updates in a row for NaN or infinity."""
 
   video: bool = True
   """Write a video of evaluation episodes."""
