@@ -46,7 +46,7 @@ TRAINS = {
 
 
 class Columns(NamedTuple):
-  """A row of docs/algorithm.md, section 3."""
+  """A row of Table I in docs/algorithm.md."""
 
   regularizer: str
   policy: str
