@@ -228,8 +228,8 @@ class ReplayConfig:
   """File of demonstrations (docs/demonstrations.md) instead of the scripted expert."""
 
   expert_noise: float = 0.03
-  """Standard deviation of the noise on the expert's joint velocities (rad/s); at 0.1 the
-  expert rarely grasps."""
+  """Standard deviation of the noise on the expert's joint velocities (rad/s); at 0.1
+  the expert rarely grasps."""
 
 
 @dataclasses.dataclass(frozen=True)
