@@ -20,8 +20,8 @@ from apnpql_jax.agents.columns.policy_evaluation import Evaluation
 from apnpql_jax.agents.heads import Heads, Networks, Params
 from apnpql_jax.agents.networks import make_networks
 from apnpql_jax.agents.table_one import Algorithm, algorithm_of, epsilon_bounds
-from apnpql_jax.config.checks import validate
-from apnpql_jax.config.schema import AgentConfig, TrainConfig
+from apnpql_jax.config.checks import check_agent
+from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.dists import boltzmann
 from apnpql_jax.types import Array, Metrics, Observation, Transition
 
@@ -58,9 +58,9 @@ def make_agent(config: AgentConfig) -> Agent:
   """Builds the agent that ``config`` describes.
 
   Raises:
-    ConfigError: for an unknown algorithm or settings that cannot work.
+    ConfigError: A setting is invalid; the message names it.
   """
-  validate(TrainConfig(agent=config), algorithms=epsilon_bounds())
+  check_agent(config, algorithms=epsilon_bounds())
   algorithm = algorithm_of(config)
   groups = algorithm.groups(config)
   evaluation = algorithm.policy_evaluation(config)

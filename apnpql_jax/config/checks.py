@@ -6,7 +6,7 @@ neither the simulator nor the learner.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import math
 from typing import Any
 
@@ -60,6 +60,7 @@ _BOUNDS = {
   "replay.expert_share": (0, 1),
 }
 _MAX_SIDE = 1024  # pixels
+_PARTS = "env.", "agent."  # checked on their own
 
 _OTHER_BYTES = 4 * (21 + 3 + 7 + 21 + 2) + 2
 """Bytes of a slot without images: robot state, tool, action, primitive labels, reward
@@ -88,16 +89,10 @@ def validate(
     ConfigError: A setting is invalid. The one-line message names it and the valid
       choices or the fix.
   """
+  check_env(config.env, tasks=tasks)
+  check_agent(config.agent, algorithms=algorithms)
   values = dict(codec.flatten(config))
-  _check_values(values)
-  if tasks is not None:
-    check_name("env.task", config.env.task, tasks)
-  if algorithms is not None:
-    check_name("agent.algorithm", config.agent.algorithm, tuple(algorithms))
-  _check_env(config.env)
-  _check_agent(config.agent)
-  if algorithms is not None and config.agent.temperature != "fixed":
-    _check_epsilon(config.agent, algorithms[config.agent.algorithm])
+  _check_values((k, v) for k, v in values.items() if not k.startswith(_PARTS))
   _check_expert(config)
   _check_replay(config, None if memory_bytes is None else memory_bytes * devices)
   for name in ("env.worlds", "replay.batch_size"):
@@ -105,36 +100,11 @@ def validate(
       raise ConfigError(f"{name}={n} must be a multiple of the {devices} devices")
 
 
-def replay_bytes(config: TrainConfig) -> int:
-  """Returns an upper bound on the bytes of both replays, without object points."""
-  images = math.prod(config.env.global_size) + math.prod(config.env.wrist_size)
-  slot = _OTHER_BYTES + (3 * images if config.env.obs == "pixels" else 0)
-  return slot * (config.replay.capacity + config.replay.expert_steps)
-
-
-def _check_values(values: Mapping[str, Any]) -> None:
-  """Checks each setting on its own; ``values`` maps dotted names to values."""
-  for name, value in values.items():
-    if isinstance(value, float) and not math.isfinite(value):
-      raise ConfigError(f"{name}={value} is not a finite number")
-    if isinstance(value, int) and value >= 2**31:
-      raise ConfigError(f"{name}={value} must be below 2**31")
-  for name in _POSITIVE:
-    if values[name] <= 0:
-      raise ConfigError(f"{name}={values[name]} must be positive")
-  for name in _NOT_NEGATIVE:
-    if values[name] < 0:
-      raise ConfigError(f"{name}={values[name]} must not be negative")
-  for name, (low, high) in _BOUNDS.items():
-    if values[name] < low:
-      raise ConfigError(f"{name}={values[name]} must be at least {low}")
-    if values[name] > high:
-      raise ConfigError(f"{name}={values[name]} must be at most {high}")
-  for name, choices in _CHOICES.items():
-    check_name(name, values[name], choices)
-
-
-def _check_env(env: EnvConfig) -> None:
+def check_env(env: EnvConfig, *, tasks: Sequence[str] | None = None) -> None:
+  """Checks the environment's settings; raises ``ConfigError`` as ``validate`` does."""
+  _check_values(codec.flatten(env, "env."))
+  if tasks is not None:
+    check_name("env.task", env.task, tasks)
   if env.episode_steps < 1:
     raise ConfigError(
       f"env.time_limit_s={env.time_limit_s} is shorter than one control period; use at "
@@ -155,7 +125,13 @@ def _check_env(env: EnvConfig) -> None:
     )
 
 
-def _check_agent(agent: AgentConfig) -> None:
+def check_agent(
+  agent: AgentConfig, *, algorithms: Mapping[str, Sequence[str]] | None = None
+) -> None:
+  """Checks the learner's settings; raises ``ConfigError`` as ``validate`` does."""
+  _check_values(codec.flatten(agent, "agent."))
+  if algorithms is not None:
+    check_name("agent.algorithm", agent.algorithm, tuple(algorithms))
   for name in ("gamma", "target_rate"):
     if not 0.0 < getattr(agent, name) <= 1.0:
       raise ConfigError(f"agent.{name}={getattr(agent, name)} must be within (0, 1]")
@@ -178,6 +154,36 @@ def _check_agent(agent: AgentConfig) -> None:
         f"agent.{start}={getattr(agent, start)} must lie between agent.{low}="
         f"{getattr(agent, low)} and agent.{high}={getattr(agent, high)}"
       )
+  if algorithms is not None and agent.temperature != "fixed":
+    _check_epsilon(agent, algorithms[agent.algorithm])
+
+
+def replay_bytes(config: TrainConfig) -> int:
+  """Returns an upper bound on the bytes of both replays, without object points."""
+  images = math.prod(config.env.global_size) + math.prod(config.env.wrist_size)
+  slot = _OTHER_BYTES + (3 * images if config.env.obs == "pixels" else 0)
+  return slot * (config.replay.capacity + config.replay.expert_steps)
+
+
+def _check_values(values: Iterable[tuple[str, Any]]) -> None:
+  """Checks each setting on its own, given as dotted name and value."""
+  for name, value in values:
+    if isinstance(value, float) and not math.isfinite(value):
+      raise ConfigError(f"{name}={value} is not a finite number")
+    if isinstance(value, int) and value >= 2**31:
+      raise ConfigError(f"{name}={value} must be below 2**31")
+    if name in _POSITIVE and value <= 0:
+      raise ConfigError(f"{name}={value} must be positive")
+    if name in _NOT_NEGATIVE and value < 0:
+      raise ConfigError(f"{name}={value} must not be negative")
+    if name in _BOUNDS:
+      low, high = _BOUNDS[name]
+      if value < low:
+        raise ConfigError(f"{name}={value} must be at least {low}")
+      if value > high:
+        raise ConfigError(f"{name}={value} must be at most {high}")
+    if name in _CHOICES:
+      check_name(name, value, _CHOICES[name])
 
 
 def _check_epsilon(agent: AgentConfig, bounds: Sequence[str]) -> None:

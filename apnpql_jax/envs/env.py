@@ -16,6 +16,7 @@ from jax.sharding import Mesh
 from jaxtyping import Bool, Float, Int, PRNGKeyArray, UInt8
 
 from apnpql_jax import devices
+from apnpql_jax.config.checks import check_env
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.envs.cameras import Renderer, make_cameras
 from apnpql_jax.envs.state import Arrival, EnvState, where_world
@@ -237,11 +238,13 @@ def make_env(config: EnvConfig, mesh: Mesh | None = None, *, instants: int = 0) 
   ``instants`` is ``agent.lstm_instants`` of the agent that acts in it.
 
   Raises:
-    ConfigError: unknown task or engine, a scene that cannot be simulated or drawn, a
-      control period that is not a multiple of the timestep, or too few usable resets.
+    ConfigError: A setting is invalid, the scene cannot be simulated or drawn, or it
+      has too few usable resets.
   """
+  check_env(config)
   task = make_task(config.task)
-  # Fail on a scene that cannot be drawn before building the bank.
+  # Fail on what the scene does not allow before building the bank.
+  _substeps(config, task.scene)
   make_cameras(config, task.scene)
   bank, _ = load_bank(task, config.bank_rows)
   return Env(config, task, bank, mesh, instants=instants)

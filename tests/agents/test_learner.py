@@ -218,6 +218,11 @@ def test_greedy_takes_the_best_candidate(agent, state):
   assert any(np.any(info["q"] < info["q_max"]) for _, info in drawn)
 
 
+def test_an_agent_that_no_default_replay_could_train_is_accepted():
+  """The settings of the environment and of the replay are not the agent's."""
+  make_agent(dataclasses.replace(CONFIG, n_step=2_000))
+
+
 def test_a_limit_that_the_samples_cannot_reach_is_rejected():
   with pytest.raises(ConfigError, match="epsilon"):
     make_agent(dataclasses.replace(CONFIG, epsilon=float(np.log(12)) + 1e-6))

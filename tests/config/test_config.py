@@ -11,7 +11,7 @@ import math
 from hypothesis import given, settings, strategies as st
 import pytest
 
-from apnpql_jax.config import codec, files, ranges, schema as config_module
+from apnpql_jax.config import checks, codec, files, ranges, schema as config_module
 from apnpql_jax.config.checks import replay_bytes, validate
 from apnpql_jax.config.files import (
   config_diff,
@@ -73,6 +73,13 @@ def test_defaults_and_presets_are_valid():
   validate(TrainConfig())
   for name in files.preset_names():
     validate(files.load_preset(name))
+
+
+def test_every_name_in_the_checks_is_that_of_a_setting():
+  tables = checks._POSITIVE, checks._NOT_NEGATIVE, checks._BOUNDS, checks._CHOICES
+  assert {name for table in tables for name in table} <= {
+    name for name, _ in codec.flatten(TrainConfig())
+  }
 
 
 def test_every_field_has_a_docstring():

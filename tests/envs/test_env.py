@@ -14,6 +14,7 @@ from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config.schema import AgentConfig, EnvConfig
 from apnpql_jax.data import replay
 from apnpql_jax.envs.env import Env, make_env
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.sim import arm
 from apnpql_jax.training import evaluate
 from apnpql_jax.training.evaluate import play_held_out
@@ -46,6 +47,24 @@ def pixel_chunk(env):
     )
   )
   return play(pixels.reset(jnp.arange(4)), jax.random.key(0))[1]
+
+
+@pytest.mark.parametrize(
+  ("setting", "words"),
+  [
+    ({"task": "juggle"}, "choose from .*push_plate"),
+    ({"obs": "State"}, "env.obs 'State'; choose from pixels, state"),
+    ({"time_limit_s": 0.1}, "env.time_limit_s=0.1 .* at least 0.15"),
+    ({"control_period_s": 0.1501}, "env.control_period_s=0.1501 must be a multiple"),
+  ],
+)
+def test_wrong_settings_are_rejected_before_the_bank_is_built(
+  setting, words, monkeypatch, tmp_path
+):
+  monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+  with pytest.raises(ConfigError, match=words):
+    make_env(dataclasses.replace(CONFIG, **setting))
+  assert not any(tmp_path.iterdir())
 
 
 def test_held_out_rows_are_never_trained_on(env):
