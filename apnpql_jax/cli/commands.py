@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from apnpql_jax.cli.options import Collect, Convert, Evaluate, List, Repeat, Train
 from apnpql_jax.config import files
-from apnpql_jax.config.checks import BACKENDS, validate
+from apnpql_jax.config.checks import BACKENDS
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs import run_folder
@@ -38,30 +38,23 @@ def base_config(args: Train) -> TrainConfig:
 
 
 def train(args: Train) -> Json:
-  """Checks all options, then trains or resumes a run and returns its summary."""
-  config = _with_shortcuts(args)
+  """Trains or resumes a run and returns its summary."""
+  config, resume = _with_shortcuts(args), args.resume is not None
   run_dir = args.resume or args.run or run_folder.new_run_dir(args.preset)
-  if args.resume is None:
-    run_folder.check_free(run_dir, overwrite=args.overwrite)
-  validate(config)
-  if args.resume is not None:
-    run_folder.check_resumable(args.resume, config)
+  # ``run_training`` repeats this; here it is fast, because JAX is not imported yet.
+  run_folder.check_start(run_dir, config, resume=resume, overwrite=args.overwrite)
   mesh = _mesh(args)
 
-  from apnpql_jax import devices, tasks
-  from apnpql_jax.agents import table_one
+  from apnpql_jax import devices
   from apnpql_jax.training.train import train as run_training
 
-  validate(
-    config,
-    tasks=tasks.task_names(),
-    algorithms=table_one.epsilon_bounds(),
-    memory_bytes=devices.available_memory(),
-    devices=mesh.size if mesh else 1,
-  )
-  resume = args.resume is not None
   summary = run_training(
-    config, run_dir, resume=resume, overwrite=args.overwrite, mesh=mesh
+    config,
+    run_dir,
+    resume=resume,
+    overwrite=args.overwrite,
+    mesh=mesh,
+    handle_signals=True,
   )
   return summary if devices.is_primary() else {}
 

@@ -9,9 +9,10 @@ import json
 import os
 from pathlib import Path
 import shutil
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from apnpql_jax.config import codec, files
+from apnpql_jax.config.checks import validate
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import ConfigError, FileError, UserError
 from apnpql_jax.runs.text import read_text, write_text
@@ -116,6 +117,29 @@ def fixed_diff(saved: TrainConfig, wanted: TrainConfig) -> str:
   """Returns the differences outside of ``MAY_CHANGE`` as one line, "" if none."""
   diff = files.config_diff(saved, wanted)
   return files.format_diff({k: x for k, x in diff.items() if k not in MAY_CHANGE})
+
+
+def check_start(
+  run_dir: Path, config: TrainConfig, *, resume: bool, overwrite: bool, **limits: Any
+) -> None:
+  """Checks settings and folder of a run before anything is built.
+
+  Args:
+    run_dir: The run folder.
+    config: Settings of the run.
+    resume: The run exists and is resumed.
+    overwrite: The run may replace another one.
+    **limits: Arguments of ``validate``, which take JAX to find out.
+
+  Raises:
+    ConfigError: A setting is invalid, or a resumed run must not change it.
+    FileError: The folder cannot be created, resumed or replaced.
+  """
+  validate(config, **limits)
+  if resume:
+    check_resumable(run_dir, config)
+  else:
+    check_free(run_dir, overwrite=overwrite)
 
 
 def check_resumable(run_dir: Path, wanted: TrainConfig) -> None:

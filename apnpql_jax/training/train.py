@@ -9,17 +9,19 @@ import contextlib
 import logging
 from pathlib import Path
 import signal
+import threading
 from typing import Any, NamedTuple
 
 from jax.sharding import Mesh
 
 from apnpql_jax import devices, errors
+from apnpql_jax.agents import table_one
 from apnpql_jax.agents.learner import Agent, make_agent
 from apnpql_jax.config import codec
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.data import demonstrations, replay
 from apnpql_jax.envs.env import Env, make_env
-from apnpql_jax.errors import RunStopped
+from apnpql_jax.errors import ConfigError, RunStopped
 from apnpql_jax.runs import checkpoint_reader, leaves, run_folder, versions
 from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
 from apnpql_jax.runs.console import say
@@ -27,6 +29,7 @@ from apnpql_jax.runs.metrics import MetricWriter
 from apnpql_jax.runs.progress import TrainProgress
 from apnpql_jax.runs.signals import Signals
 from apnpql_jax.runs.sinks import check_sinks, make_sinks
+from apnpql_jax.tasks import make_task, task_names
 from apnpql_jax.training import expert, faults
 from apnpql_jax.training.expert import ExpertReplay, collect_expert
 from apnpql_jax.training.iteration import make_iteration
@@ -47,11 +50,12 @@ class Start(NamedTuple):
 
 def train(
   config: TrainConfig,
-  run_dir: Path,
+  run_dir: Path | str,
   *,
   resume: bool = False,
   overwrite: bool = False,
   mesh: Mesh | None = None,
+  handle_signals: bool = False,
 ) -> dict[str, Any]:
   """Trains to ``config.total_steps`` or until a signal, then saves.
 
@@ -61,19 +65,38 @@ def train(
     resume: Resume from the newest readable checkpoint in ``run_dir``.
     overwrite: Replace the run in ``run_dir`` as soon as the new one can start.
     mesh: Devices to train on; the default device if None.
+    handle_signals: Save and stop at SIGINT or SIGTERM. The process ends at once if
+      there is nothing to save yet, and at a second signal. Python allows this in the
+      main thread only. By default, Ctrl-C raises ``KeyboardInterrupt`` as usual.
 
   Returns:
     The run folder, steps, updates and the last evaluation.
 
   Raises:
     UserError: The run cannot start; nothing was written.
-    RunStopped: The run was saved after SIGINT or SIGTERM, or it cannot continue and
-      its checkpoints are unchanged.
+    RunStopped: The run was saved after a signal, or it cannot continue and its
+      checkpoints are unchanged.
   """
+  run_dir = Path(run_dir)
+  run_folder.check_start(
+    run_dir,
+    config,
+    resume=resume,
+    overwrite=overwrite,
+    tasks=task_names(),
+    algorithms=table_one.epsilon_bounds(),
+    memory_bytes=devices.available_memory(),
+    devices=mesh.size if mesh else 1,
+  )
+  check_sinks(config.sinks)
+  if handle_signals and threading.current_thread() is not threading.main_thread():
+    raise ConfigError("handle_signals=True works in the main thread only")
+  devices.barrier()  # All have checked the folder before the first one writes to it.
   hint = f"to continue: --resume {run_dir}"
-  with Signals(
+  signals = Signals(
     f"stopped before the first iteration; {hint if resume else 'nothing is saved'}"
-  ) as signals:
+  )
+  with signals if handle_signals else contextlib.nullcontext():
     start = _start(config, run_dir, mesh, resume=resume, overwrite=overwrite)
     _say(f"run folder {start.path}; compiling, which can take minutes")
     try:
@@ -137,7 +160,6 @@ def _start(
   """Builds or restores everything; creates the run folder last."""
   # Orbax logs a traceback per thread when a save fails; the run reports it in one line.
   logging.getLogger("absl").setLevel(logging.CRITICAL)
-  check_sinks(config.sinks)
   count = mesh.size if mesh else 1
   if resume:
     path = run_folder.open_run(run_dir).path
@@ -146,14 +168,16 @@ def _start(
   saved = resume and checkpoint_reader.latest_step(run_dir) is not None
   if saved:
     checkpoint_reader.restore(run_dir, None, {}, config=config)  # Fails early.
+  fill = None if saved else _expert(config)
   env = make_env(config.env, mesh, instants=config.agent.lstm_instants)
   agent = make_agent(config.agent)
   example = example_state(config, env, agent)
   devices.check_memory(leaves.nbytes(example), "the training state")
-  if saved:
+  if fill is None:
     state = restore(config, run_dir, example, _say)
     return Start(env, agent, path, state, int(state.env_steps))
-  state = initial_state(config, env, agent, _expert(config, env))
+  _say("filling the expert replay")
+  state = initial_state(config, env, agent, fill)
   if state.expert_replay is not None:
     solved, ended = map(int, replay.episodes(state.expert_replay))
     _say(f"expert replay: {solved} of {ended} episodes solved")
@@ -166,13 +190,12 @@ def _start(
   return Start(env, agent, run_folder.open_run(run_dir).path, state, None)
 
 
-def _expert(config: TrainConfig, env: Env) -> ExpertReplay:
-  """Returns how to fill the expert replay: from a file or by the scripted expert."""
+def _expert(config: TrainConfig) -> ExpertReplay:
+  """Returns how to fill the expert replay; reads the demonstrations, if any."""
   if not config.replay.demonstrations:
-    _say("collecting the expert replay")
     return collect_expert
-  path = Path(config.replay.demonstrations)
-  demos = demonstrations.load(path, env.task, env.config.control_period_s)
+  path, task = Path(config.replay.demonstrations), make_task(config.env.task)
+  demos = demonstrations.load(path, task, config.env.control_period_s)
   _say(f"{demos.instants} time steps of {path} for {config.replay.expert_steps} slots")
   return lambda config, env, _: expert.replay_from_demonstrations(demos, config, env)
 

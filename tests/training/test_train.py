@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 import dataclasses
 import json
 from pathlib import Path
@@ -14,8 +16,9 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
+from apnpql_jax import testing
 from apnpql_jax.config.schema import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
-from apnpql_jax.errors import UserError
+from apnpql_jax.errors import ConfigError, FileError, UserError
 from apnpql_jax.runs import checkpoint_reader, run_folder
 from apnpql_jax.training.evaluate import evaluate
 from apnpql_jax.training.train import train
@@ -36,11 +39,54 @@ CONFIG = TrainConfig(
 )
 
 
+def in_thread(function: Callable[[], dict]) -> dict:
+  """Calls a function outside of the main thread, as servers and notebooks may do."""
+  with ThreadPoolExecutor(1) as pool:
+    return pool.submit(function).result()
+
+
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory) -> tuple[Path, dict]:
   """Returns the folder of a finished run and the result of ``train``."""
   run_dir = tmp_path_factory.mktemp("runs") / "run"
-  return run_dir, train(CONFIG, run_dir, resume=False)
+  return run_dir, in_thread(lambda: train(CONFIG, str(run_dir)))
+
+
+def changed(**settings: object) -> TrainConfig:
+  return dataclasses.replace(testing.TINY, **settings)
+
+
+@pytest.mark.parametrize(
+  ("config", "options", "error", "words"),
+  [
+    (changed(rollout_length=3), {}, ConfigError, "replay.capacity=64 .* use 60"),
+    (changed(sinks=("tape",)), {}, ConfigError, "'tape'"),
+    (
+      changed(replay=dataclasses.replace(testing.TINY.replay, demonstrations="none")),
+      {},
+      FileError,
+      "none is no archive",
+    ),
+    (testing.TINY, {"run_dir": "old"}, FileError, "old' holds a run"),
+    (changed(seed=1), {"run_dir": "old", "resume": True}, ConfigError, "seed 0 -> 1"),
+  ],
+  ids=["settings", "sinks", "demonstrations", "folder", "resume"],
+)
+def test_a_run_that_cannot_start_builds_and_writes_nothing(
+  config, options, error, words, tmp_path, monkeypatch
+):
+  monkeypatch.chdir(tmp_path)
+  monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # Of the banks.
+  run_folder.create(Path("old"), testing.TINY)
+  before = sorted(tmp_path.rglob("*"))
+  with pytest.raises(error, match=words):
+    train(config, **{"run_dir": "new"} | options)
+  assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_only_the_main_thread_can_be_asked_to_handle_signals(tmp_path):
+  with pytest.raises(ConfigError, match="main thread"):
+    in_thread(lambda: train(CONFIG, tmp_path / "run", handle_signals=True))
 
 
 def test_a_run_writes_all_its_files(finished):
