@@ -7,7 +7,6 @@ help and errors are fast.
 from __future__ import annotations
 
 import dataclasses
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -63,10 +62,6 @@ def evaluate(args: Evaluate) -> Json:
   """Plays held-out episodes with a checkpoint of a run."""
   if not args.run:
     raise ConfigError("evaluate needs a run folder: apnpql evaluate RUN")
-  _check_episodes(args.episodes, args.seed)
-  _check_video(args.video)
-  if args.backend is not None:
-    check_name("backend", args.backend, BACKENDS)
   run_folder.load_run_config(Path(args.run), say)
 
   from apnpql_jax.training.evaluate import evaluate as evaluate_run
@@ -84,11 +79,6 @@ def evaluate(args: Evaluate) -> Json:
 
 def collect(args: Collect) -> Json:
   """Plays episodes with the scripted expert of a task."""
-  _check_episodes(args.episodes, args.seed)
-  _check_video(args.video)
-  check_name("backend", args.backend, BACKENDS)
-  if not 0.0 <= args.noise < float("inf"):
-    raise ConfigError(f"--noise {args.noise} must be a finite number of at least 0")
   # The expert acts on privileged poses, so images are not needed.
   env = dataclasses.replace(_task_env(args.task), backend=args.backend, obs="state")
 
@@ -200,24 +190,3 @@ def _checkpoint_step(args: Evaluate) -> int | None:
   raise ConfigError(
     f"unknown --checkpoint {args.checkpoint!r}; choose from newest, best, or a step"
   )
-
-
-def _check_episodes(episodes: int, seed: int) -> None:
-  if episodes < 1:
-    raise ConfigError(f"--episodes {episodes} must be at least 1")
-  if not 0 <= seed < 2**31:
-    raise ConfigError(f"--seed {seed} must be within 0 and 2**31 - 1")
-
-
-def _check_video(path: Path | None) -> None:
-  if path is None:
-    return
-  if path.suffix not in (".mp4", ".gif"):
-    raise ConfigError(f"--video {path} must end in .mp4 or .gif")
-  try:
-    folder = next(p for p in path.absolute().parents if p.exists())
-    fit = folder.is_dir() and os.access(folder, os.W_OK) and not path.is_dir()
-  except OSError as error:
-    raise ConfigError(f"--video {path}: {error}") from None
-  if not fit:
-    raise ConfigError(f"--video {path} cannot be written")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from pathlib import Path
 import time
 from typing import Any
@@ -14,8 +15,10 @@ import numpy as np
 
 from apnpql_jax import devices
 from apnpql_jax.agents.learner import make_agent
+from apnpql_jax.config.checks import check_env
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.envs.env import Env, make_env
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.runs import checkpoint_reader, leaves, run_folder
 from apnpql_jax.runs.console import say
 from apnpql_jax.runs.metrics import wilson_interval
@@ -72,14 +75,14 @@ def figures_of(played: Episodes) -> dict[str, Any]:
 
 
 def evaluate(
-  run_dir: Path,
+  run_dir: Path | str,
   *,
-  episodes: int,
-  seed: int,
+  episodes: int = 200,
+  seed: int = 0,
   backend: str | None = None,
   step: int | None = None,
   greedy: bool = False,
-  video: Path | None = None,
+  video: Path | str | None = None,
 ) -> dict[str, Any]:
   """Plays held-out episodes with a checkpoint of a run.
 
@@ -96,12 +99,15 @@ def evaluate(
     The success rate with its confidence interval, and what produced it.
 
   Raises:
+    ConfigError: An argument is invalid; nothing was built.
     FileError: Not a run folder, or no readable checkpoint.
   """
-  began = time.monotonic()
+  began, run_dir = time.monotonic(), Path(run_dir)
+  video = _check(episodes, seed, video)
   config = run_folder.open_run(run_dir).config
-  checkpoint_reader.restore(run_dir, step, {}, config=config)  # Fails early.
   env_config = dataclasses.replace(config.env, backend=backend or config.env.backend)
+  check_env(env_config)
+  checkpoint_reader.restore(run_dir, step, {}, config=config)  # Fails early.
   env = make_env(env_config, instants=config.agent.lstm_instants)
   agent = make_agent(config.agent)
   example = jax.eval_shape(
@@ -125,14 +131,40 @@ def evaluate_expert(
   episodes: int,
   seed: int,
   noise: float,
-  video: Path | None = None,
+  video: Path | str | None = None,
 ) -> dict[str, Any]:
-  """Plays held-out episodes with the task's scripted expert; see ``evaluate``."""
-  began = time.monotonic()
+  """Plays held-out episodes with the task's scripted expert; see ``evaluate``.
+
+  ``noise`` is the standard deviation of the noise on its joint velocities in rad/s.
+  """
+  began, video = time.monotonic(), _check(episodes, seed, video)
+  if not 0.0 <= noise < math.inf:
+    raise ConfigError(f"noise={noise} must be a finite number of at least 0")
   env = make_env(env_config)
   play = make_player(env, lambda _: expert_policy(env, noise=noise))
   played = play_held_out(env, play, None, episodes=episodes, seed=seed)
   return _summary(env, played, {"algorithm": "expert"}, None, began, video)
+
+
+def _check(episodes: int, seed: int, video: Path | str | None) -> Path | None:
+  """Checks the arguments of an evaluation; returns the path of its video."""
+  if episodes < 1:
+    raise ConfigError(f"episodes={episodes} must be at least 1")
+  if not 0 <= seed < 2**31:
+    raise ConfigError(f"seed={seed} must be within 0 and 2**31 - 1")
+  if video is None:
+    return None
+  path = Path(video)
+  if path.suffix not in (".mp4", ".gif"):
+    raise ConfigError(f"video {path} must end in .mp4 or .gif")
+  try:
+    folder = next(p for p in path.absolute().parents if p.exists())
+    fit = folder.is_dir() and os.access(folder, os.W_OK) and not path.is_dir()
+  except OSError as error:
+    raise ConfigError(f"video {path}: {error}") from None
+  if not fit:
+    raise ConfigError(f"video {path} cannot be written")
+  return path
 
 
 def _summary(

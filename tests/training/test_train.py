@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 import dataclasses
+import inspect
 import json
 from pathlib import Path
 import signal
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 
 from apnpql_jax import testing
+from apnpql_jax.cli.options import Evaluate
 from apnpql_jax.config.schema import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
 from apnpql_jax.errors import ConfigError, FileError, UserError
 from apnpql_jax.runs import checkpoint_reader, run_folder
@@ -114,7 +116,7 @@ def test_a_run_writes_all_its_files(finished):
 def test_evaluate_reports_the_newest_checkpoint(finished, tmp_path):
   run_dir, _ = finished
   video = tmp_path / "videos" / "four.mp4"
-  figures = evaluate(run_dir, episodes=4, seed=3, greedy=True, video=video)
+  figures = evaluate(str(run_dir), episodes=4, seed=3, greedy=True, video=str(video))
   assert figures["checkpoint_step"] == 64
   assert figures["episodes"] == 4 and figures["greedy"]
   # All time steps of all four, the last of each held.
@@ -123,6 +125,29 @@ def test_evaluate_reports_the_newest_checkpoint(finished, tmp_path):
   assert figures["backend"] == "native" and figures["algorithm"] == "ap_npql"
   low, high = figures["ci95"]
   assert 0 <= low <= figures["success_rate"] <= high <= 1
+
+
+@pytest.mark.parametrize(
+  ("argument", "words"),
+  [
+    ({"episodes": 0}, "episodes=0 must be at least 1"),
+    ({"seed": -1}, "seed=-1 must be within"),
+    ({"backend": "bullet"}, "'bullet'; choose from auto"),
+    ({"video": "x.avi"}, "x.avi must end in .mp4 or .gif"),
+  ],
+)
+def test_evaluate_rejects_arguments_before_it_looks_for_checkpoints(
+  argument, words, tmp_path
+):
+  run_folder.create(tmp_path / "run", CONFIG)
+  with pytest.raises(ConfigError, match=words):
+    evaluate(tmp_path / "run", **argument)
+
+
+def test_evaluate_has_the_defaults_of_the_command_line():
+  defaults = inspect.signature(evaluate).parameters
+  for name in ("episodes", "seed", "backend", "greedy", "video"):
+    assert defaults[name].default == getattr(Evaluate(), name)
 
 
 def test_resume_continues_the_run(finished):
