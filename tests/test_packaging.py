@@ -16,6 +16,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 import pytest
 
+from apnpql_jax import runtime
 from apnpql_jax.config import files
 from apnpql_jax.errors import ConfigError
 
@@ -120,6 +121,11 @@ def test_lock_satisfies_the_requirements_of_the_project(lock, wanted):
   for requirement in map(Requirement, wanted):
     version = versions[canonicalize_name(requirement.name)]
     assert requirement.specifier.contains(version, prereleases=True), requirement
+
+
+def test_the_workflow_caches_what_the_tests_compile():
+  workflow = (ROOT / ".github" / "workflows" / "checks.yml").read_text()
+  assert f"path: {runtime.cache_dir().relative_to(ROOT)}\n" in workflow
 
 
 def test_mujoco_and_mjx_are_a_matched_pair():
