@@ -18,7 +18,7 @@ if TYPE_CHECKING:
   from apnpql_jax.config.ranges import RandomizationConfig
   from apnpql_jax.config.schema import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
   from apnpql_jax.envs.env import Env, make_env
-  from apnpql_jax.errors import ConfigError, RunStopped, UserError
+  from apnpql_jax.errors import ConfigError, FileError, RunStopped, UserError
   from apnpql_jax.runtime import configure
   from apnpql_jax.tasks.task import Task, make_task, register_task, task_names
   from apnpql_jax.training.evaluate import evaluate
@@ -30,7 +30,7 @@ _MODULES = {
   "config.ranges": ("RandomizationConfig",),
   "config.schema": ("AgentConfig", "EnvConfig", "ReplayConfig", "TrainConfig"),
   "envs.env": ("Env", "make_env"),
-  "errors": ("ConfigError", "RunStopped", "UserError"),
+  "errors": ("ConfigError", "FileError", "RunStopped", "UserError"),
   "runtime": ("configure",),
   "tasks.task": ("Task", "make_task", "register_task", "task_names"),
   "training.evaluate": ("evaluate",),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 from pathlib import Path
+import re
 import subprocess
 import sys
 
@@ -38,6 +39,14 @@ def test_dir_lists_every_name_and_type_checkers_see_the_same():
   assert len(lazy) > 15
   assert declared().keys() == lazy | {"__version__"}
   assert lazy <= set(dir(apnpql_jax))
+
+
+def test_the_reference_lists_every_name_with_its_module():
+  page = (ROOT / "docs" / "reference.md").read_text()
+  links = re.findall(r"\[`(\w+)`\]\(\.\./apnpql_jax/([\w/]+)\.py#(\w+)\)", page)
+  listed = {name: path.replace("/", ".") for name, path, _ in links}
+  assert listed == apnpql_jax._HOME
+  assert all(name == anchor for name, _, anchor in links)
 
 
 def test_unknown_name_is_an_attribute_error():
