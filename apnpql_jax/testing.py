@@ -57,7 +57,7 @@ TINY_ARGS = (
   "--rollout-length 2 --updates-per-iteration 2 --eval-every 1000000 "
   "--eval-episodes 4 --checkpoint-every 16 --no-video"
 ).split()
-"""Options that turn the preset push_plate into ``TINY``."""
+"""Options that give the run of a preset the sizes of ``TINY``."""
 
 
 def start(
