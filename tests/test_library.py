@@ -5,17 +5,19 @@ from __future__ import annotations
 import ast
 import os
 from pathlib import Path
+import re
 import subprocess
 import sys
 
 from apnpql_jax import testing
 
-SCRIPT = testing.ROOT / "docs" / "examples" / "library.py"
 
-
-def test_the_example_of_the_library_page_runs(tmp_path: Path):
+def test_the_script_of_the_library_page_runs(tmp_path: Path):
+  page = (testing.ROOT / "docs" / "library.md").read_text()
+  (script,) = re.findall(r"^```python\n(.*?)^```$", page, re.M | re.S)
+  (tmp_path / "script.py").write_text(script)
   done = subprocess.run(
-    [sys.executable, str(SCRIPT)],
+    [sys.executable, "script.py"],
     cwd=tmp_path,
     env=os.environ | {"XLA_FLAGS": testing.XLA_FLAGS, "PYTHONPATH": str(testing.ROOT)},
     capture_output=True,

@@ -44,10 +44,10 @@ class Agent:
   evaluation: Evaluation
   # (key, example observation with a batch axis) -> state before learning.
   init: Callable[[PRNGKeyArray, Observation], LearnerState]
-  # (params, observation [B], key, greedy) -> actions f32[B, 7], info f32[B] each: the
-  # action's log_prob, which Retrace needs, and for diagnosis its q, the candidates'
-  # q_max and ess, and alpha. ``greedy`` is a Python bool.
-  act: Callable[[Params, Observation, PRNGKeyArray, bool], tuple[Array, Metrics]]
+  # (params, observation [B], key, *, greedy=False) -> actions f32[B, 7], info f32[B]
+  # each: the action's log_prob, which Retrace needs, and for diagnosis its q, the
+  # candidates' q_max and ess, and alpha. ``greedy`` is a Python bool.
+  act: Callable[..., tuple[Array, Metrics]]
   # (state, transitions [B], key) -> state after one update, metrics f32[].
   update: Callable[
     [LearnerState, Transition, PRNGKeyArray], tuple[LearnerState, Metrics]
@@ -75,7 +75,11 @@ def make_agent(config: AgentConfig) -> Agent:
     return LearnerState(params, target_params, nu, opt_state, jnp.zeros((), jnp.int32))
 
   def act(
-    params: Params, observation: Observation, key: PRNGKeyArray, greedy: bool = False
+    params: Params,
+    observation: Observation,
+    key: PRNGKeyArray,
+    *,
+    greedy: bool = False,
   ) -> tuple[Array, Metrics]:
     heads = networks.at(params, observation)
     return sample_action(algorithm, heads, key, greedy=greedy)

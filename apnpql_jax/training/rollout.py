@@ -30,7 +30,7 @@ def agent_policy(agent: Agent, params: Params, *, greedy: bool) -> Policy:
   """Returns the learned policy, which depends on observations only."""
 
   def policy(state: EnvState, key: Array) -> tuple[Array, Array]:
-    action, info = agent.act(params, state.observation, key, greedy)
+    action, info = agent.act(params, state.observation, key, greedy=greedy)
     return action, info["log_prob"]
 
   return policy

@@ -123,7 +123,7 @@ def test_the_replay_returns_the_observations_that_the_lstm_acted_on(env):
     weights = jax.random.normal(jax.random.key(0), flat.shape[1:])
     return jnp.tanh(flat @ weights / 10.0)
 
-  def act(params, observation: Observation, key, greedy):
+  def act(params, observation: Observation, key, *, greedy):
     action = jnp.full((16, 7), 0.5).at[:, 0].set(velocity(observation))
     return action, {"log_prob": jnp.zeros(16)}
 
