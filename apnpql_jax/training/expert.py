@@ -88,33 +88,33 @@ def replay_from_demonstrations(
   """
   worlds, length = config.env.worlds, _length(config)
   index = np.resize(np.arange(demos.instants), (worlds, length)).T
-  fresh = demos.first[index]
-  fresh[0] = True  # A column may begin within an episode.
+  slots = _rows(demos, index)
+  slots.first[0] = True  # A column may begin within an episode.
   ends = np.append(demos.first[1:], True)[index]
   targets = np.zeros((length, worlds, 3, 6), np.float32)
-  targets[fresh] = _solve_targets(demos, index[fresh], env)
+  targets[slots.first] = _solve_targets(demos, index[slots.first], env)
 
   @jax.jit
   def remake(
-    start: EnvState, index: Array, fresh: Array, targets: Array, ends: Array
+    start: EnvState, slots: Demonstrations, targets: Array, ends: Array
   ) -> Replay:
     def step(before: EnvState, inputs: tuple) -> tuple[EnvState, Slot]:
-      rows, fresh, targets, ends = inputs
-      now = _states(demos, env.task.scene, rows)
-      state = env.observe(Arrival.after(before, now, targets, fresh))
+      shown, targets, ends = inputs
+      now = _states(shown, env.task.scene)
+      state = env.observe(Arrival.after(before, now, targets, shown.first))
       timestep = state.timestep
       timestep = timestep.replace(
         truncated=timestep.truncated | ends & ~timestep.terminated
       )
-      action = jnp.asarray(demos.action, jnp.float32)[rows]
+      action = jnp.asarray(shown.action, jnp.float32)
       return state, Slot(timestep, action, jnp.full(worlds, CERTAIN, jnp.float32))
 
-    _, chunk = jax.lax.scan(step, start, (index, fresh, targets, ends))
+    _, chunk = jax.lax.scan(step, start, (slots, targets, ends))
     ring = replay.add(replay.create(example_slot(start), length, worlds), chunk)
     return place(ring, env.mesh)
 
   start = env.reset(jnp.zeros(worlds, jnp.int32))
-  return remake(start, *map(jnp.asarray, (index, fresh, targets, ends)))
+  return remake(start, slots, targets, ends)
 
 
 def save_expert(path: Path, config: EnvConfig, **settings: Any) -> dict[str, Any]:
@@ -166,20 +166,25 @@ def _length(config: TrainConfig) -> int:
   return config.replay.expert_steps // config.env.worlds
 
 
-def _states(demos: Demonstrations, scene: Scene, rows: Array) -> PhysicsState:
+def _rows(demos: Demonstrations, rows: np.ndarray) -> Demonstrations:
+  """Returns a copy of these instants, with the leading axes of ``rows``."""
+  return Demonstrations(*(x[rows] for x in demos))
+
+
+def _states(demos: Demonstrations, scene: Scene) -> PhysicsState:
   f32 = {
-    name: jnp.asarray(getattr(demos, name), jnp.float32)[rows]
+    name: jnp.asarray(getattr(demos, name), jnp.float32)
     for name in ("qpos", "qvel", "mocap_pos", "mocap_quat")
   }
   qvel = f32.pop("qvel")
-  state = physics.initial_state(scene, **f32, variant=jnp.asarray(demos.variant)[rows])
+  state = physics.initial_state(scene, **f32, variant=jnp.asarray(demos.variant))
   return state.replace(qvel=qvel)
 
 
 def _solve_targets(demos: Demonstrations, rows: np.ndarray, env: Env) -> np.ndarray:
   """Returns f32[len(rows), 3, 6]: joint targets of the primitives at these rows."""
   unique, inverse = np.unique(rows, return_inverse=True)
-  state = _states(demos, env.task.scene, jnp.asarray(unique))
+  state = _states(_rows(demos, unique), env.task.scene)
   positions, rotations, _ = map(np.asarray, env.tool_targets(state))
   starts = np.asarray(state.qpos[:, env.task.scene.arm_qpos])
   targets, residuals = ik.solve_all(starts, positions, rotations)

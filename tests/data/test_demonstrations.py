@@ -8,6 +8,7 @@ from typing import Any
 
 from hypothesis import HealthCheck, given, settings, strategies as st
 import jax
+from jax.experimental.compilation_cache import compilation_cache
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -98,6 +99,26 @@ def test_the_replay_is_what_the_worlds_showed(demos, env):
     if t < STEPS:
       action = jnp.asarray(demos.action[begin + t])
       state = step(state, action, jax.random.key(t))
+
+
+def test_another_file_needs_no_other_program(demos, env, tmp_path):
+  """Two files of different lengths, converted with an empty compilation cache."""
+  names = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
+  before = {name: getattr(jax.config, name) for name in names}
+  compilation_cache.reset_cache()
+  for name, value in zip(names, (str(tmp_path), 0.0), strict=True):
+    jax.config.update(name, value)
+  try:
+    programs = []
+    for end in (STEPS + 1, 2 * (STEPS + 1)):
+      some = Demonstrations(*(x[:end] for x in demos))
+      expert.replay_from_demonstrations(some, CONFIG, env)
+      programs.append(sorted(path.name for path in tmp_path.glob("jit_remake-*-cache")))
+  finally:
+    for name, value in before.items():
+      jax.config.update(name, value)
+    compilation_cache.reset_cache()
+  assert len(programs[0]) == 1 and programs[0] == programs[1]
 
 
 def test_the_name_is_the_one_asked_for(tmp_path, demos, env):
