@@ -14,6 +14,9 @@ import os
 from pathlib import Path
 import re
 import sys
+from typing import Any
+
+from apnpql_jax.errors import UserError
 
 MIN_THREADS = 4  # XLA:CPU threads per emulated device, which share a pool
 # Operations that XLA:CPU runs in the library YNNPACK; its default adds "REDUCE".
@@ -23,19 +26,32 @@ _FLAG, _FLAG_VERSIONS = "xla_cpu_experimental_ynn_fusion_type", r"0\.1[01]\."
 
 
 def configure() -> None:
-  """Sets threads, XLA flags, cache and precision; must run before JAX runs anything."""
-  _set_threads()
-  _set_fusions()
+  """Sets threads, XLA flags, cache and precision; must run before JAX runs anything.
+
+  Raises:
+    UserError: JAX has run something, so a setting that is missing would have no effect.
+  """
+  wanted = _threads() | _fusions()
+  changed = {k: value for k, value in wanted.items() if os.environ.get(k) != value}
   defaults = {
     "jax_compilation_cache_dir": str(cache_dir() / "xla"),
     # By default XLA multiplies f32 matrices in TF32 (10 bits of mantissa) on GPUs. Mass
     # matrices, forward kinematics and so contacts would lose three digits.
     "jax_default_matmul_precision": "highest",
   }
+  jax: Any = sys.modules.get("jax")
+  bridge: Any = sys.modules.get("jax._src.xla_bridge")
+  unset = [name for name in defaults if jax and getattr(jax.config, name, None) is None]
+  if (changed or unset) and bridge and bridge.backends_are_initialized():
+    names = ", ".join((*changed, *(name.upper() for name in unset)))
+    raise UserError(
+      f"JAX has run something, so it is too late to set {names}; restart Python and "
+      "call configure() first"
+    )
+  os.environ.update(changed)
   for name, value in defaults.items():
     os.environ.setdefault(name.upper(), value)
-    jax = sys.modules.get("jax")
-    if jax is not None and getattr(jax.config, name, None) is None:
+    if name in unset:
       jax.config.update(name, os.environ[name.upper()])
 
 
@@ -59,26 +75,28 @@ def quiet_warp() -> Generator[None, None, None]:
         print(line)
 
 
-def _set_threads() -> None:
+def _threads() -> dict[str, str]:
+  """Returns the variables that give XLA:CPU enough threads."""
   # The batched Cholesky of XLA:CPU waits in a pool thread for other pool threads. In a
   # pool of two, two such calls deadlock (seen from 128 worlds on); in a pool of four
   # they do not. XLA sizes the pool by these variables or the number of cores.
   minimum = MIN_THREADS * _cpu_devices()
   given = [x for x in ("PJRT_NPROC", "NPROC") if os.environ.get(x, "").isdigit()]
-  for name in given:
-    os.environ[name] = str(max(minimum, int(os.environ[name])))
   if not given and cores() < minimum:
-    os.environ["NPROC"] = str(minimum)
+    return {"NPROC": str(minimum)}
+  return {name: str(max(minimum, int(os.environ[name]))) for name in given}
 
 
-def _set_fusions() -> None:
+def _fusions() -> dict[str, str]:
+  """Returns the variable that keeps sums out of YNNPACK, with the flags of the user."""
   # The sums of MJX's line search are too small for YNNPACK: with "REDUCE", a physics
   # step takes 1.3 to 1.8 times as long. Updates of the presets become faster without it
   # too; those with batch 32 and 30 candidates become 8 % slower.
   flags = os.environ.get("XLA_FLAGS", "")
   flag = fusions_flag(*KEPT_FUSIONS)
-  if flag and _FLAG not in flags:
-    os.environ["XLA_FLAGS"] = f"{flags} {flag}".lstrip()
+  if not flag or _FLAG in flags:
+    return {}
+  return {"XLA_FLAGS": f"{flags} {flag}".lstrip()}
 
 
 def fusions_flag(*kinds: str) -> str:

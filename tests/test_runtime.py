@@ -139,6 +139,22 @@ def test_jax_has_the_settings_whichever_is_imported_first(order, tmp_path):
   assert run(code, XDG_CACHE_HOME=str(tmp_path)).split() == [str(cache), "highest"]
 
 
+@pytest.mark.parametrize("also", ["", f"{CONFIGURE};"], ids=["late", "again"])
+def test_settings_that_come_too_late_are_an_error(also):
+  code = (
+    f"import jax, os; os.environ['NPROC'] = '2'; {also} jax.numpy.ones(1)\n"
+    f"before = dict(os.environ)\ntry: {CONFIGURE}\n"
+    "except apnpql_jax.UserError as error: print(error)\n"
+    "assert os.environ == before"
+  )
+  said = run(code)
+  if also:
+    assert said == ""
+  else:
+    assert "too late to set NPROC, XLA_FLAGS, JAX_COMPILATION_CACHE_DIR" in said
+    assert said.endswith("call configure() first\n")
+
+
 def test_quiet_warp_drops_only_its_two_lines(capsys):
   with runtime.quiet_warp():
     print("Failed to import warp: No module named 'warp'")
