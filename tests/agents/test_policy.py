@@ -41,7 +41,7 @@ class KnownValues(Heads):
 def heads() -> KnownValues:
   networks = make_networks(CONFIG, GROUPS, TD0(CONFIG))
   seen = random_batch(0, STATES).observation_tm1
-  params = networks.init(jax.random.key(0), seen)
+  params = jax.jit(networks.init)(jax.random.key(0), seen)
   params["policy"]["out"]["bias"] = 0.2 * jnp.sin(jnp.arange(29.0))
   bound = networks.at(params, seen)
   return KnownValues(bound.networks, bound.params, bound.phi)
