@@ -14,6 +14,7 @@ from jaxtyping import Float, Int, PRNGKeyArray
 import optax
 
 from apnpql_jax.agents import losses
+from apnpql_jax.agents.acting import choose_action
 from apnpql_jax.agents.augmentation import augment
 from apnpql_jax.agents.columns.candidates import Candidates
 from apnpql_jax.agents.columns.policy_evaluation import Evaluation
@@ -44,10 +45,10 @@ class Agent:
   evaluation: Evaluation
   # (key, example observation with a batch axis) -> state before learning.
   init: Callable[[PRNGKeyArray, Observation], LearnerState]
-  # (params, observation [B], key, greedy) -> actions f32[B, 7], info f32[B] each: the
-  # action's log_prob, which Retrace needs, and for diagnosis its q, the candidates'
-  # q_max and ess, and alpha. ``greedy`` is a Python bool.
-  act: Callable[[Params, Observation, PRNGKeyArray, bool], tuple[Array, Metrics]]
+  # (params, observation [B], key, *, acting="policy") -> actions f32[B, 7], info f32[B]
+  # each: the action's log_prob, which Retrace needs, and for diagnosis its q, the
+  # candidates' q_max and ess, and alpha. ``acting.choose_action`` lists the rules.
+  act: Callable[..., tuple[Array, Metrics]]
   # (state, transitions [B], key) -> state after one update, metrics f32[].
   update: Callable[
     [LearnerState, Transition, PRNGKeyArray], tuple[LearnerState, Metrics]
@@ -76,10 +77,14 @@ def make_agent(config: AgentConfig) -> Agent:
     return LearnerState(params, target_params, nu, opt_state, jnp.zeros((), jnp.int32))
 
   def act(
-    params: Params, observation: Observation, key: PRNGKeyArray, greedy: bool = False
+    params: Params,
+    observation: Observation,
+    key: PRNGKeyArray,
+    *,
+    acting: str = "policy",
   ) -> tuple[Array, Metrics]:
     heads = networks.at(params, observation)
-    return sample_action(algorithm, heads, key, greedy=greedy)
+    return choose_action(algorithm, heads, key, acting=acting)
 
   def update(
     state: LearnerState, batch: Transition, key: PRNGKeyArray
@@ -139,32 +144,6 @@ def make_optimizer(
   step = {"encoder": "e_step", "ap": "e_step", "z": "e_step", "bp": "m_step"}
   labels = {group: step.get(group, group) for group in (*groups, "nu")}
   return optax.partition({k: adam(rates[k]) for k in labels.values()}, labels)
-
-
-def sample_action(
-  algorithm: Algorithm, heads: Heads, key: PRNGKeyArray, *, greedy: bool
-) -> tuple[Array, Metrics]:
-  """Draws candidates and picks one by weight (paper Sec. III-B), see ``Agent.act``."""
-  key_candidates, key_pick = jax.random.split(key)
-  candidates = algorithm.policy(
-    heads,
-    algorithm.regularizer(heads, heads),
-    key_candidates,
-    num_samples=heads.config.policy_samples,
-    greedy=greedy,
-  )
-  q_values, weights = candidates.q_values, candidates.weights
-  chosen = boltzmann.pick(key_pick, weights)
-  actions = jnp.take_along_axis(candidates.actions, chosen[None, :, None], axis=0)
-  q = jnp.take_along_axis(q_values, chosen[None], axis=0)
-  info = {
-    "q": q[0],
-    "q_max": jnp.max(q_values, axis=0),
-    "alpha": heads.alpha(),
-    "ess": boltzmann.effective_sample_size(weights),
-    "log_prob": candidates.log_prob(actions, q)[0],
-  }
-  return actions[0], info
 
 
 def bellman_target(

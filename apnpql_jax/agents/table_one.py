@@ -40,7 +40,7 @@ class Algorithm:
   """One row of Table I; the columns are functions."""
 
   regularizer: Callable[..., ActionDistribution]  # (heads, target network's heads) -> b
-  policy: Callable[..., Candidates]  # (heads, b, key, num_samples, greedy)
+  policy: Callable[..., Candidates]  # (heads, b, key, num_samples)
   regularizer_update: Callable[..., Losses]  # (heads, b, candidates, batch, key, nu)
   policy_update: Callable[..., Improvement]  # (heads, b, key)
   policy_evaluation: Callable[[AgentConfig], Evaluation]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from apnpql_jax.cli.options import Collect, Convert, Evaluate, List, Repeat, Train
 from apnpql_jax.config import files
-from apnpql_jax.config.checks import BACKENDS, validate
+from apnpql_jax.config.checks import ACTING, BACKENDS, validate
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs import run_folder
@@ -74,6 +74,8 @@ def evaluate(args: Evaluate) -> Json:
   _check_video(args.video)
   if args.backend is not None:
     check_name("backend", args.backend, BACKENDS)
+  if args.acting is not None:
+    check_name("acting", args.acting, ACTING)
   run_folder.load_run_config(Path(args.run), say)
 
   from apnpql_jax.training.evaluate import evaluate as evaluate_run
@@ -84,7 +86,7 @@ def evaluate(args: Evaluate) -> Json:
     seed=args.seed,
     backend=args.backend,
     step=_checkpoint_step(args),
-    greedy=args.greedy,
+    acting=args.acting,
     video=args.video,
   )
 

@@ -104,8 +104,9 @@ class Evaluate(_Play):
   checkpoint: str = "newest"
   """Checkpoint: newest, best (highest success rate in training) or its step."""
 
-  greedy: _Flag = False
-  """Take the best candidate, or a parametric policy's mean, instead of sampling."""
+  acting: Annotated[str | None, _default_hint("(default: as in training)")] = None
+  """How to choose an action: policy draws from the policy, mean takes the mean of its
+  likeliest component, prior draws from b without Q, greedy takes the highest Q."""
 
   backend: Annotated[str | None, _default_hint("(default: as in training)")] = None
   """Physics engine: auto, mjx or native."""

@@ -17,12 +17,14 @@ from apnpql_jax.errors import ConfigError, check_name
 
 BACKENDS = ("auto", "mjx", "native")
 OBSERVATIONS = ("pixels", "state")
+ACTING = ("policy", "mean", "prior", "greedy")
 EVALUATIONS = ("row", "categorical", "td0", "retrace", "clipped_double_q")
 IMAGE_FEATURES = ("map", "keypoints", "both")
 
 _CHOICES = {
   "env.backend": BACKENDS,
   "env.obs": OBSERVATIONS,
+  "eval_acting": ACTING,
   "agent.temperature": ("state", "shared", "fixed"),
   "agent.regularizer": ("row", "uniform"),
   "agent.policy_evaluation": EVALUATIONS,

@@ -263,6 +263,9 @@ class TrainConfig:
   eval_episodes: int = 64
   """Held-out episodes per evaluation."""
 
+  eval_acting: str = codec.added("policy")
+  """How evaluations choose an action: policy (draws), mean, prior or greedy."""
+
   checkpoint_every: int = 20_000
   """Environment steps between checkpoints."""
 

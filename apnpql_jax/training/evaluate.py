@@ -78,7 +78,7 @@ def evaluate(
   seed: int,
   backend: str | None = None,
   step: int | None = None,
-  greedy: bool = False,
+  acting: str | None = None,
   video: Path | None = None,
 ) -> dict[str, Any]:
   """Plays held-out episodes with a checkpoint of a run.
@@ -89,7 +89,8 @@ def evaluate(
     seed: Random seed of bank rows and actions.
     backend: Physics engine; that of the run if None.
     step: Step of the checkpoint; the newest if None.
-    greedy: Take the candidate of highest value, or a parametric policy's mean.
+    acting: Rule that chooses actions, see ``agents/acting.py``; that of the run's
+      evaluations if None.
     video: File for a video of the first episodes; failures to write are only printed.
 
   Returns:
@@ -113,9 +114,10 @@ def evaluate(
   for line in found.damaged:
     say(line)
   learner = found.items["learner"]
-  play = make_player(env, lambda params: agent_policy(agent, params, greedy=greedy))
+  acting = acting or config.eval_acting
+  play = make_player(env, lambda params: agent_policy(agent, params, acting=acting))
   played = play_held_out(env, play, learner.target_params, episodes=episodes, seed=seed)
-  about = {"algorithm": config.agent.algorithm, "greedy": greedy}
+  about = {"algorithm": config.agent.algorithm, "acting": acting}
   return _summary(env, played, about, found.step, began, video)
 
 

@@ -32,7 +32,7 @@ def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
 
   def iteration(state: TrainState) -> tuple[TrainState, Metrics]:
     key, rollout_key, update_key = jax.random.split(state.key, 3)
-    policy = agent_policy(agent, state.learner.target_params, greedy=False)
+    policy = agent_policy(agent, state.learner.target_params, acting="policy")
     worlds, chunk = rollout(
       env, policy, state.env, rollout_key, length=config.rollout_length
     )

@@ -26,11 +26,14 @@ _LEAST_NOISE = 1e-6
 """Standard deviation in rad/s for zero noise; denser than any policy."""
 
 
-def agent_policy(agent: Agent, params: Params, *, greedy: bool) -> Policy:
-  """Returns the learned policy, which depends on observations only."""
+def agent_policy(agent: Agent, params: Params, *, acting: str) -> Policy:
+  """Returns the learned policy, which depends on observations only.
+
+  ``acting`` is a rule of ``agents/acting.py``.
+  """
 
   def policy(state: EnvState, key: Array) -> tuple[Array, Array]:
-    action, info = agent.act(params, state.observation, key, greedy)
+    action, info = agent.act(params, state.observation, key, acting=acting)
     return action, info["log_prob"]
 
   return policy

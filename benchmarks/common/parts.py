@@ -63,7 +63,7 @@ def prepare(
     found["rendering"] = _ready(images, (state.physics,))
 
   def act(params: Any, state: EnvState, key: Array) -> tuple[Array, Array]:
-    return agent_policy(agent, params, greedy=False)(state, key)
+    return agent_policy(agent, params, acting="policy")(state, key)
 
   return found | {"networks": _ready(act, (params, state, jax.random.key(0)))}
 

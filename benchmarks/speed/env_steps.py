@@ -38,7 +38,7 @@ def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
   params = jax.jit(agent.init)(jax.random.key(0), state.observation).params
   policies: dict[str, Callable[[Any], Policy]] = {
     "env": lambda params: parts.random_policy,
-    "env_policy": functools.partial(agent_policy, agent, greedy=False),
+    "env_policy": functools.partial(agent_policy, agent, acting="policy"),
   }
   players = {}
   for name, policy in policies.items():

@@ -25,10 +25,9 @@ def main(run: Path) -> None:
   env, agent = apnpql.make_env(config.env), apnpql.make_agent(config.agent)
   state = env.reset(jnp.arange(4))  # One world per row of the bank of reset states.
   learner = agent.init(jax.random.key(0), state.observation)
-  act, step = jax.jit(agent.act, static_argnums=3), jax.jit(env.step)
+  act, step = jax.jit(agent.act), jax.jit(env.step)
   for key in jax.random.split(jax.random.key(1), 10):
-    # The last argument is "greedy"; actions are f32[4, 7].
-    action, _ = act(learner.params, state.observation, key, False)
+    action, _ = act(learner.params, state.observation, key)  # f32[4, 7]
     state = step(state, action, key)
   print("rewards:", state.timestep.reward)
   print(apnpql.train(config, run, overwrite=True))

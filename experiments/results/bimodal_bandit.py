@@ -97,7 +97,7 @@ def play(config: AgentConfig, *, updates: int, draws: int, seed: int = 0) -> np.
   @jax.jit
   def run(state):
     state, _ = jax.lax.scan(update, state, jax.random.split(key_train, updates))
-    return agent.act(state.params, observation(draws), key_act, False)[0]
+    return agent.act(state.params, observation(draws), key_act)[0]
 
   return np.asarray(run(agent.init(key_init, observation(1))))
 

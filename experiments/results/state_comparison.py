@@ -136,7 +136,7 @@ def train(task: str, row: str, seed: int) -> None:
     play = [*apnpql, "evaluate", str(run), *play]
     final, greedy = (
       json.loads(subprocess.check_output([*play, *flags]))
-      for flags in ([], ["--greedy"])
+      for flags in ([], ["--acting", "greedy"])
     )
     result = {
       "command": command,

@@ -141,11 +141,7 @@ def test_candidates_are_as_many_as_asked_for(target: int, policy: int):
   assert metrics["npql/ess"] == pytest.approx(policy, rel=0.05)
   batch, key = random_batch(0, BATCH), jax.random.key(0)
   update = str(jax.make_jaxpr(agent.update)(state, batch, key))
-  acting = str(
-    jax.make_jaxpr(lambda *x: agent.act(*x, False))(
-      state.params, batch.observation_tm1, key
-    )
-  )
+  acting = str(jax.make_jaxpr(agent.act)(state.params, batch.observation_tm1, key))
   of_target, of_policy = (f"f32[{n},{BATCH},7]" for n in (target, policy))
   assert of_target in update and of_policy in update
   assert of_policy in acting and of_target not in acting

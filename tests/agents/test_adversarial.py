@@ -82,7 +82,7 @@ def test_no_batch_produces_a_number_that_is_not_finite(
     keys = jax.random.split(jax.random.key(1), updates)
     state, history = jax.lax.scan(body, state, keys)
     last = absurd_batch(rows, jax.random.key(3)).observation_tm1
-    return state, *history, *agent.act(state.params, last, jax.random.key(2), False)
+    return state, *history, *agent.act(state.params, last, jax.random.key(2))
 
   state, metrics, met, action, info = run(state)
   assert np.any(met)  # A large reward, in a state with a white image if there are any.

@@ -184,8 +184,8 @@ def test_both_cameras_are_trained_by_the_value(agent, camera: str):
 def test_actions_lie_in_the_action_box(agent, state):
   params = jax.tree.map(lambda x: x, state.params)
   params["ap"]["out"]["bias"] = jnp.linspace(-3.0, 3.0, 21)
-  actions, info = jax.jit(agent.act, static_argnums=3)(
-    params, random_batch(7).observation_tm1, jax.random.key(0), False
+  actions, info = jax.jit(agent.act)(
+    params, random_batch(7).observation_tm1, jax.random.key(0)
   )
   assert actions.shape == (BATCH, 7)
   assert np.all(np.abs(actions) <= 1.0)
@@ -194,7 +194,7 @@ def test_actions_lie_in_the_action_box(agent, state):
   assert all(v.shape == (BATCH,) for v in info.values())
 
 
-def test_greedy_takes_the_best_candidate(agent, state):
+def test_greedy_takes_the_highest_q(agent, state):
   """The parameters are set to prefer a closed gripper and a fast first joint."""
   params = jax.tree.map(lambda x: x, state.params)
   z = {k: jax.tree.map(jnp.zeros_like, v) for k, v in params["z"].items()}
@@ -206,10 +206,10 @@ def test_greedy_takes_the_best_candidate(agent, state):
   )
   params["z"] = z
   observation = random_batch(8).observation_tm1
-  act = jax.jit(agent.act, static_argnums=3)
+  act = jax.jit(agent.act, static_argnames="acting")
   keys = [jax.random.key(k) for k in range(30)]
-  greedy = [act(params, observation, k, True) for k in keys]
-  drawn = [act(params, observation, k, False) for k in keys]
+  greedy = [act(params, observation, k, acting="greedy") for k in keys]
+  drawn = [act(params, observation, k) for k in keys]
   for actions, info in greedy:
     np.testing.assert_array_equal(info["q"], info["q_max"])
     assert np.all(actions[:, 6] == 1.0)

@@ -85,18 +85,6 @@ def test_parametric_policy_sums_over_the_gripper(heads):
   )
 
 
-def test_greedy_takes_the_best_draw_or_the_mean_of_the_policy(heads):
-  prior, policy = heads.prior(), heads.policy()
-  for k in range(3):
-    key = jax.random.key(k)
-    q = non_parametric(heads, prior, key, num_samples=50, greedy=True)
-    np.testing.assert_array_equal(q.value, q.q_values.max(0))
-    pi = parametric(heads, policy, key, num_samples=50, greedy=True)
-    action = jnp.sum(pi.weights[..., None] * pi.actions, axis=0)
-    np.testing.assert_array_equal(action[:, :6], np.clip(policy.loc[:, 0], -1.0, 1.0))
-    np.testing.assert_array_equal(action[:, 6], policy.gripper_logits[:, 0] > 0.0)
-
-
 def test_cross_entropy_method_comes_nearer_than_its_first_draw(heads):
   prior = UniformBox((STATES,), 6)
   best = cem(heads, prior, jax.random.key(3), num_samples=0)

@@ -214,9 +214,8 @@ def test_actions_are_those_of_the_policy_that_the_row_names(name: str):
   example = example_of(name)
   heads = example.heads(example.trained)
   key, _ = jax.random.split(KEY)
-  _, info = example.agent.act(
-    example.trained, example.batch.observation_tm1, KEY, False
-  )
+  act = jax.jit(example.agent.act)
+  _, info = act(example.trained, example.batch.observation_tm1, KEY)
   kind = COLUMNS[name].policy
   if kind == "cem":
     expected = np.ones(BATCH)

@@ -130,7 +130,7 @@ def expert(world: World, key: Array) -> tuple[Array, Array]:
 def learned(agent: Agent, state: LearnerState) -> Policy:
   def policy(world: World, key: Array) -> tuple[Array, Array]:
     observation = world.timestep.observation
-    action, info = agent.act(state.params, observation, key, False)
+    action, info = agent.act(state.params, observation, key)
     return action, info["log_prob"]
 
   return policy

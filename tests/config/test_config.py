@@ -38,6 +38,7 @@ ADDED = {
   "agent.wrist_features": "map",
   "agent.image_shift": 0,
   "agent.color_jitter": 0.0,
+  "eval_acting": "policy",
   "replay.demonstrations": "",
 }
 """Behavior of runs from before these settings existed. No value here may ever

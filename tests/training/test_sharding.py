@@ -100,7 +100,7 @@ def compare(backend: str) -> None:
   result["messages"] = messages.messages(iteration)
 
   def play(state: TrainState) -> Any:
-    policy = agent_policy(agent, state.learner.params, greedy=False)
+    policy = agent_policy(agent, state.learner.params, acting="policy")
     return rollout(several, policy, state.env, state.key, length=2)
 
   result["messages_of_rollout"] = messages.messages(

@@ -64,9 +64,9 @@ def test_a_run_writes_all_its_files(finished):
 def test_evaluate_reports_the_newest_checkpoint(finished, tmp_path):
   run_dir, _ = finished
   video = tmp_path / "videos" / "two.mp4"
-  figures = evaluate(run_dir, episodes=2, seed=3, greedy=True, video=video)
+  figures = evaluate(run_dir, episodes=2, seed=3, acting="mean", video=video)
   assert figures["checkpoint_step"] == 64
-  assert figures["episodes"] == 2 and figures["greedy"]
+  assert figures["episodes"] == 2 and figures["acting"] == "mean"
   # All instants of both, the last of each held.
   frames = len(iio.imread(next(video.parent.iterdir()), plugin="pyav"))
   assert frames == 2 * (figures["mean_length"] + HOLD)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from apnpql_jax.agents.heads import Heads
 from apnpql_jax.dists.action import ActionDistribution
 
 
@@ -46,3 +47,17 @@ class Candidates(struct.PyTreeNode):
 def clip_action(actions: Float[Array, "*b 7"]) -> Float[Array, "*b 7"]:
   """Clips joint velocities to [-1, 1] rad/s; leaves the gripper in {0, 1} unchanged."""
   return jnp.clip(actions, -1.0, 1.0)
+
+
+def evaluate(
+  heads: Heads, samples: Float[Array, " s *b 7"]
+) -> tuple[Float[Array, " s *b 7"], Float[Array, " s *b n"], Float[Array, " s *b"]]:
+  """Returns clipped actions, the outputs of the value head, and Q."""
+  actions = clip_action(samples)
+  outputs = heads.z(actions)
+  return actions, outputs, heads.networks.value(outputs)
+
+
+def all_on_the_highest(x: Float[Array, " s *b"]) -> Float[Array, " s *b"]:
+  """Returns weights that select the highest score over S."""
+  return jax.nn.one_hot(jnp.argmax(x, axis=0), x.shape[0], axis=0, dtype=x.dtype)
