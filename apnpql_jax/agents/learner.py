@@ -17,8 +17,7 @@ from apnpql_jax.agents import losses
 from apnpql_jax.agents.augmentation import augment
 from apnpql_jax.agents.columns.candidates import Candidates
 from apnpql_jax.agents.columns.policy_evaluation import Evaluation
-from apnpql_jax.agents.heads import Heads, Networks, Params
-from apnpql_jax.agents.networks import make_networks
+from apnpql_jax.agents.networks import Heads, Networks, Params, make_networks
 from apnpql_jax.agents.table_one import Algorithm, algorithm_of, epsilon_bounds
 from apnpql_jax.config.checks import validate
 from apnpql_jax.config.schema import AgentConfig, TrainConfig
@@ -64,7 +63,9 @@ def make_agent(config: AgentConfig) -> Agent:
   algorithm = algorithm_of(config)
   groups = algorithm.groups(config)
   evaluation = algorithm.policy_evaluation(config)
-  networks = make_networks(config, groups, evaluation)
+  networks = make_networks(
+    config, groups, evaluation.head(config.hidden), evaluation.value
+  )
   optimizer = make_optimizer(config, groups)
   loss = functools.partial(total_loss, networks, algorithm, evaluation)
 

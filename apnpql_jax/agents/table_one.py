@@ -29,7 +29,7 @@ from apnpql_jax.agents.columns.regularizer import (
   previous_policy,
   uniform,
 )
-from apnpql_jax.agents.heads import GROUPS
+from apnpql_jax.agents.networks import GROUPS
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.dists.action import ActionDistribution
 from apnpql_jax.errors import ConfigError, check_name

@@ -9,8 +9,8 @@ from flax import struct
 import jax
 import jax.numpy as jnp
 
-from apnpql_jax.agents.heads import Params
 from apnpql_jax.agents.learner import Agent
+from apnpql_jax.agents.networks import Params
 from apnpql_jax.envs.env import Env
 from apnpql_jax.envs.state import EnvState
 from apnpql_jax.sim.physics import PhysicsState

@@ -14,9 +14,8 @@ from scipy import ndimage, special
 
 from apnpql_jax.agents import encoder
 from apnpql_jax.agents.columns.policy_evaluation import Categorical
-from apnpql_jax.agents.heads import GROUPS, Heads, Networks
 from apnpql_jax.agents.mixture_head import mixture_from_outputs, one_way_clip
-from apnpql_jax.agents.networks import make_networks
+from apnpql_jax.agents.networks import GROUPS, Heads, Networks, make_networks
 from apnpql_jax.config.checks import IMAGE_FEATURES
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.types import Observation
@@ -28,7 +27,9 @@ CONFIG = AgentConfig(
 
 def all_networks(config: AgentConfig = CONFIG) -> Networks:
   """Networks with every group, and categorical values."""
-  return make_networks(config, GROUPS, Categorical(config))
+  evaluation = Categorical(config)
+  head = evaluation.head(config.hidden)
+  return make_networks(config, GROUPS, head, evaluation.value)
 
 
 def observation(batch: int, *, pixels: bool, objects: bool = False) -> Observation:

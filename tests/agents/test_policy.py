@@ -16,8 +16,7 @@ from scipy import special
 from apnpql_jax.agents.columns import policy_update
 from apnpql_jax.agents.columns.policy import cem, non_parametric, parametric
 from apnpql_jax.agents.columns.policy_evaluation import TD0
-from apnpql_jax.agents.heads import GROUPS, Heads
-from apnpql_jax.agents.networks import make_networks
+from apnpql_jax.agents.networks import GROUPS, Heads, make_networks
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.dists.action import UniformBox
 from apnpql_jax.testing import random_batch
@@ -39,7 +38,9 @@ class KnownValues(Heads):
 
 @pytest.fixture(scope="module")
 def heads() -> KnownValues:
-  networks = make_networks(CONFIG, GROUPS, TD0(CONFIG))
+  evaluation = TD0(CONFIG)
+  head = evaluation.head(CONFIG.hidden)
+  networks = make_networks(CONFIG, GROUPS, head, evaluation.value)
   seen = random_batch(0, STATES).observation_tm1
   params = networks.init(jax.random.key(0), seen)
   params["policy"]["out"]["bias"] = 0.2 * jnp.sin(jnp.arange(29.0))

@@ -17,8 +17,8 @@ from scipy import special
 from apnpql_jax.agents import table_one
 from apnpql_jax.agents.columns import regularizer
 from apnpql_jax.agents.columns.candidates import clip_action
-from apnpql_jax.agents.heads import Heads
 from apnpql_jax.agents.learner import Agent, bellman_target, make_agent, total_loss
+from apnpql_jax.agents.networks import Heads
 from apnpql_jax.agents.table_one import ALGORITHMS, algorithm_of
 from apnpql_jax.config import checks
 from apnpql_jax.dists.action import ActionDistribution, UniformBox

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from apnpql_jax.agents.columns.candidates import Candidates, clip_action
-from apnpql_jax.agents.heads import Heads
+from apnpql_jax.agents.networks import Heads
 from apnpql_jax.dists import boltzmann
 from apnpql_jax.dists.action import ActionDistribution
 from apnpql_jax.dists.gmm import GripperGMM

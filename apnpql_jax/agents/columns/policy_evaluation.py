@@ -19,8 +19,8 @@ import numpy as np
 
 from apnpql_jax.agents import losses
 from apnpql_jax.agents.columns.candidates import Candidates
-from apnpql_jax.agents.heads import Heads
-from apnpql_jax.agents.modules import TwinValueHeads, ValueHead
+from apnpql_jax.agents.layers import TwinValueHeads, ValueHead
+from apnpql_jax.agents.networks import Heads
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.dists import categorical
 from apnpql_jax.types import Array, Observation, Transition
@@ -38,7 +38,7 @@ class Evaluation(abc.ABC):
 
   @abc.abstractmethod
   def head(self, hidden: Sequence[int]) -> nn.Module:
-    """Builds the value head; see ``modules.ValueHead`` for its inputs and outputs."""
+    """Builds the value head; see ``layers.ValueHead`` for its inputs and outputs."""
 
   @abc.abstractmethod
   def value(self, outputs: Float[Array, "*b n"]) -> Float[Array, "*b"]:

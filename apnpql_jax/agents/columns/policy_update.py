@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from apnpql_jax.agents import losses
 from apnpql_jax.agents.columns.candidates import Candidates
 from apnpql_jax.agents.columns.policy import non_parametric, parametric
-from apnpql_jax.agents.heads import Heads
+from apnpql_jax.agents.networks import Heads
 from apnpql_jax.dists import boltzmann
 from apnpql_jax.dists.action import ActionDistribution
 from apnpql_jax.types import Array

@@ -1,4 +1,4 @@
-"""The flax modules behind the heads (paper Fig. 2 and Sec. IV-B)."""
+"""The flax modules of the heads (paper Fig. 2 and Sec. IV-B)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 _small = nn.initializers.variance_scaling(1e-4, "fan_in", "truncated_normal")
 
 
-class Head(nn.Module):
+class MLP(nn.Module):
   """Hidden relu layers and a linear layer that starts near zero."""
 
   hidden: Sequence[int]
@@ -26,7 +26,7 @@ class Head(nn.Module):
 
 
 class Constant(nn.Module):
-  """One trained number for all states, in place of a ``Head`` with one output."""
+  """One trained number for all states, in place of an ``MLP`` with one output."""
 
   @nn.compact
   def __call__(self, x: Float[Array, "*b n"]) -> Float[Array, "*b 1"]:
