@@ -16,7 +16,7 @@ import optax
 from apnpql_jax.agents import losses
 from apnpql_jax.agents.augmentation import augment
 from apnpql_jax.agents.columns.candidates import Candidates
-from apnpql_jax.agents.columns.policy_evaluation import Evaluation
+from apnpql_jax.agents.columns.policy_evaluation import PolicyEvaluation
 from apnpql_jax.agents.networks import Heads, Networks, Params, make_networks
 from apnpql_jax.agents.table_one import Algorithm, algorithm_of, epsilon_bounds
 from apnpql_jax.config.checks import validate
@@ -40,7 +40,7 @@ class Agent:
   """Pure functions of one configuration; all can be jitted, scanned and sharded."""
 
   networks: Networks
-  evaluation: Evaluation
+  policy_evaluation: PolicyEvaluation
   # (key, example observation with a batch axis) -> state before learning.
   init: Callable[[PRNGKeyArray, Observation], LearnerState]
   # (params, observation [B], key, greedy) -> actions f32[B, 7], info f32[B] each: the
@@ -170,7 +170,7 @@ def sample_action(
 def bellman_target(
   networks: Networks,
   algorithm: Algorithm,
-  evaluation: Evaluation,
+  evaluation: PolicyEvaluation,
   target_params: Params,
   batch: Transition,
   key: PRNGKeyArray,
@@ -189,7 +189,7 @@ def bellman_target(
 def total_loss(
   networks: Networks,
   algorithm: Algorithm,
-  evaluation: Evaluation,
+  evaluation: PolicyEvaluation,
   trained: Params,
   target_params: Params,
   batch: Transition,

@@ -11,7 +11,7 @@ from apnpql_jax.agents.columns.policy_evaluation import (
   TD0,
   Categorical,
   ClippedDoubleQ,
-  Evaluation,
+  PolicyEvaluation,
   Retrace,
 )
 from apnpql_jax.agents.columns.policy_update import (
@@ -43,7 +43,7 @@ class Algorithm:
   policy: Callable[..., Candidates]  # (heads, b, key, num_samples, greedy)
   regularizer_update: Callable[..., Losses]  # (heads, b, candidates, batch, key, nu)
   policy_update: Callable[..., Improvement]  # (heads, b, key)
-  policy_evaluation: Callable[[AgentConfig], Evaluation]
+  policy_evaluation: Callable[[AgentConfig], PolicyEvaluation]
 
   def groups(self, config: AgentConfig) -> tuple[str, ...]:
     """Returns the parameter groups that the columns read, in order of ``GROUPS``."""
@@ -76,7 +76,7 @@ ALGORITHMS = {
     behavior_prior,  cem,            fit_candidates,   none,       ClippedDoubleQ),
 }  # fmt: skip
 
-EVALUATIONS = {  # values of ``agent.policy_evaluation`` other than "row"
+POLICY_EVALUATIONS = {  # values of ``agent.policy_evaluation`` other than "row"
   "categorical": Categorical,
   "td0": TD0,
   "retrace": Retrace,
@@ -95,7 +95,7 @@ def algorithm_of(config: AgentConfig) -> Algorithm:
   if config.regularizer == "uniform":
     row = dataclasses.replace(row, regularizer=uniform, regularizer_update=no_update)
   if config.policy_evaluation != "row":
-    evaluation = EVALUATIONS[config.policy_evaluation]
+    evaluation = POLICY_EVALUATIONS[config.policy_evaluation]
     row = dataclasses.replace(row, policy_evaluation=evaluation)
   if row.policy is cem and row.policy_evaluation is Retrace:
     raise ConfigError(

@@ -94,7 +94,7 @@ def make_sample(
     expert_share=config.replay.expert_share,
     n_step=config.agent.n_step,
     gamma=config.agent.gamma,
-    windows=agent.evaluation.windows,
+    windows=agent.policy_evaluation.windows,
     instants=config.agent.lstm_instants,
   )
   if mesh is None:

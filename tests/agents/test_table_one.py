@@ -99,10 +99,10 @@ def example_of(name: str) -> Example:
 
   def losses(trained, batch):
     target = bellman_target(
-      agent.networks, row, agent.evaluation, slow, batch, jax.random.key(1)
+      agent.networks, row, agent.policy_evaluation, slow, batch, jax.random.key(1)
     )
     total, metrics = total_loss(
-      agent.networks, row, agent.evaluation, trained, slow, batch, target, KEY
+      agent.networks, row, agent.policy_evaluation, trained, slow, batch, target, KEY
     )
     parts = {k: v for k, v in metrics.items() if k.startswith("loss/")}
     return parts, (total, metrics)
@@ -131,7 +131,7 @@ def test_each_loss_trains_exactly_the_parameters_the_paper_names(name: str):
 
 
 def test_settings_name_every_evaluation():
-  assert {"row", *table_one.EVALUATIONS} == set(checks.EVALUATIONS)
+  assert {"row", *table_one.POLICY_EVALUATIONS} == set(checks.POLICY_EVALUATIONS)
 
 
 def regularizer_of(name: str, heads: Heads, slow: Heads) -> ActionDistribution:

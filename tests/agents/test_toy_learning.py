@@ -182,7 +182,7 @@ def train_step(agent: Agent, carry, key: Array):
       expert_share=0.25,
       n_step=CONFIG.n_step,
       gamma=CONFIG.gamma,
-      windows=agent.evaluation.windows,
+      windows=agent.policy_evaluation.windows,
     )
     return agent.update(state, batch, key_update)
 

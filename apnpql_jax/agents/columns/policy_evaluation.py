@@ -30,7 +30,7 @@ TargetPolicy = Callable[[Observation], tuple[Heads, Candidates]]
 
 
 @dataclasses.dataclass(frozen=True)
-class Evaluation(abc.ABC):
+class PolicyEvaluation(abc.ABC):
   """How values are represented and learned."""
 
   config: AgentConfig
@@ -59,7 +59,7 @@ class Evaluation(abc.ABC):
     return target
 
 
-class Categorical(Evaluation):
+class Categorical(PolicyEvaluation):
   """Return distributions on fixed atoms (paper Eq. 8)."""
 
   @property
@@ -97,7 +97,7 @@ class Categorical(Evaluation):
     return categorical.mean(target, self.atoms)
 
 
-class TD0(Evaluation):
+class TD0(PolicyEvaluation):
   """A scalar value, regressed on r + gamma E_pi[Q(s', a')]."""
 
   def head(self, hidden: Sequence[int]) -> nn.Module:
