@@ -13,7 +13,7 @@ PACKAGE = ROOT / "apnpql_jax"
 NAME = PACKAGE.name
 
 STAIR = (
-  "version errors types runtime dists config devices sim render tasks "
+  "errors types runtime dists config devices sim render tasks "
   "randomization primitives envs agents data runs training testing cli __main__"
 ).split()
 """Rooms from the bottom up: each imports only from itself and from earlier ones."""

@@ -132,9 +132,9 @@ def repeat(args: Repeat) -> Json:
   path = Path(args.file).absolute()
   run_folder.load_run_config(path.parent.parent, say)
 
-  from apnpql_jax.training import faults
+  from apnpql_jax.training import skipped_updates
 
-  return faults.repeat(path)
+  return skipped_updates.repeat(path)
 
 
 def list_names(args: List) -> Json:

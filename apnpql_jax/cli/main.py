@@ -11,7 +11,7 @@ import signal
 import sys
 from typing import Any
 
-from apnpql_jax import errors, runtime
+from apnpql_jax import __version__, errors, runtime
 from apnpql_jax.cli import commands, options
 from apnpql_jax.cli.commands import Json
 from apnpql_jax.cli.options import Train, parse
@@ -19,7 +19,6 @@ from apnpql_jax.config import files
 from apnpql_jax.errors import ConfigError, UserError, check_name
 from apnpql_jax.runs.console import say
 from apnpql_jax.runs.signals import Signals
-from apnpql_jax.version import __version__
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -14,8 +14,8 @@ from typing import NamedTuple
 from apnpql_jax.config import codec, files
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import ConfigError, FileError, UserError
+from apnpql_jax.runs.provenance import describe_versions
 from apnpql_jax.runs.text import read_text, write_text
-from apnpql_jax.runs.versions import describe_versions
 
 CONFIG_FILE = "config.json"
 """Its presence makes a folder a run folder."""

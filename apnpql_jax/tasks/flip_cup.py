@@ -26,7 +26,7 @@ from apnpql_jax.sim import arm
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.tasks import geometry, pinch
-from apnpql_jax.tasks.base import FreeBody, TableTask, draw_pair
+from apnpql_jax.tasks.table_task import FreeBody, TableTask, draw_pair
 from apnpql_jax.tasks.task import ResetDraw, ToolTargets, register_task
 from apnpql_jax.types import Array
 

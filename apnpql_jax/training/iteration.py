@@ -17,7 +17,7 @@ from apnpql_jax.envs.env import Env
 from apnpql_jax.training.expert import add_chunk
 from apnpql_jax.training.placement import place
 from apnpql_jax.training.rollout import agent_policy, rollout
-from apnpql_jax.training.state import Faults, TrainState
+from apnpql_jax.training.state import SkippedUpdates, TrainState
 from apnpql_jax.types import Metrics, Transition
 
 Iteration = Callable[[TrainState], tuple[TrainState, Metrics]]
@@ -77,7 +77,7 @@ def _update(agent, sample, ring, expert_replay, carry, key) -> Any:
   leaves = jax.tree.leaves((batch, norms, updated.nu))
   ok = jnp.stack([jnp.isfinite(x).all() for x in leaves]).all()
   learner = jax.tree.map(functools.partial(jnp.where, ok), updated, learner)
-  faults = Faults(
+  faults = SkippedUpdates(
     in_a_row=jnp.where(ok, 0, faults.in_a_row + 1),
     key=jnp.where(ok, faults.key, key),
   )

@@ -16,7 +16,7 @@ from apnpql_jax.envs.state import EnvState
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.types import ARM_DOF, Array, Slot
 
-Policy = Callable[[EnvState, Array], tuple[Array, Array]]
+WorldPolicy = Callable[[EnvState, Array], tuple[Array, Array]]
 """(worlds, key) -> actions f32[worlds, 7], log densities f32[worlds]."""
 
 FILMED = 4
@@ -26,7 +26,7 @@ _LEAST_NOISE = 1e-6
 """Standard deviation in rad/s for zero noise; denser than any policy."""
 
 
-def agent_policy(agent: Agent, params: Params, *, greedy: bool) -> Policy:
+def agent_policy(agent: Agent, params: Params, *, greedy: bool) -> WorldPolicy:
   """Returns the learned policy, which depends on observations only."""
 
   def policy(state: EnvState, key: Array) -> tuple[Array, Array]:
@@ -36,7 +36,7 @@ def agent_policy(agent: Agent, params: Params, *, greedy: bool) -> Policy:
   return policy
 
 
-def expert_policy(env: Env, *, noise: float) -> Policy:
+def expert_policy(env: Env, *, noise: float) -> WorldPolicy:
   """Returns the task's scripted expert with Gaussian noise on its joint velocities.
 
   ``noise`` is its standard deviation in rad/s.
@@ -56,7 +56,7 @@ def expert_policy(env: Env, *, noise: float) -> Policy:
 
 
 def rollout(
-  env: Env, policy: Policy, state: EnvState, key: Array, *, length: int
+  env: Env, policy: WorldPolicy, state: EnvState, key: Array, *, length: int
 ) -> tuple[EnvState, Slot]:
   """Plays ``length`` control periods in every world, episode after episode.
 
@@ -85,7 +85,7 @@ Player = Callable[[Any, Array, Array], Episodes]
 """(parameters of the policy, bank rows i32[worlds], key) -> episodes."""
 
 
-def make_player(env: Env, make_policy: Callable[[Any], Policy]) -> Player:
+def make_player(env: Env, make_policy: Callable[[Any], WorldPolicy]) -> Player:
   """Returns a jitted function that plays one episode per row until all are over.
 
   A world that becomes non-finite counts as failed.

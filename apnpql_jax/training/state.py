@@ -17,7 +17,7 @@ from apnpql_jax.training.placement import place, shardings
 from apnpql_jax.types import Array
 
 
-class Faults(struct.PyTreeNode):
+class SkippedUpdates(struct.PyTreeNode):
   """Updates skipped because they were not finite."""
 
   in_a_row: Array  # i32[]: consecutive ones, up to now
@@ -33,7 +33,7 @@ class TrainState(struct.PyTreeNode):
   expert_replay: Replay | None
   key: Array  # typed PRNG key
   env_steps: Array  # i32[]: environment steps done, summed over worlds
-  faults: Faults
+  faults: SkippedUpdates
 
 
 def initial_state(
@@ -56,7 +56,7 @@ def initial_state(
       expert_replay=None,
       key=key,
       env_steps=jnp.zeros((), jnp.int32),
-      faults=Faults(in_a_row=jnp.zeros((), jnp.int32), key=fault_key),
+      faults=SkippedUpdates(in_a_row=jnp.zeros((), jnp.int32), key=fault_key),
     )
     return place(state, env.mesh)
 

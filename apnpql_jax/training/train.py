@@ -20,14 +20,14 @@ from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.data import demonstrations, replay
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.errors import RunStopped
-from apnpql_jax.runs import checkpoint_reader, leaves, run_folder, versions
+from apnpql_jax.runs import checkpoint_reader, leaves, provenance, run_folder
 from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
 from apnpql_jax.runs.console import say
 from apnpql_jax.runs.metrics import MetricWriter
 from apnpql_jax.runs.progress import TrainProgress
 from apnpql_jax.runs.signals import Signals
 from apnpql_jax.runs.sinks import check_sinks, make_sinks
-from apnpql_jax.training import expert, faults
+from apnpql_jax.training import expert, skipped_updates
 from apnpql_jax.training.expert import ExpertReplay, collect_expert
 from apnpql_jax.training.iteration import make_iteration
 from apnpql_jax.training.reporter import Reporter
@@ -141,7 +141,7 @@ def _start(
   count = mesh.size if mesh else 1
   if resume:
     path = run_folder.open_run(run_dir).path
-    for change in versions.changed_versions(path, devices=count):
+    for change in provenance.changed_versions(path, devices=count):
       _say(f"changed since the run began: {change}")
   saved = resume and checkpoint_reader.latest_step(run_dir) is not None
   if saved:
@@ -190,7 +190,7 @@ def _loop(config, start, iteration, reporter, saver, signals) -> TrainState:
     metrics |= saver.finished()
     if reporter:
       reporter.iteration(step, int(state.learner.step), metrics)
-    faults.check(config, state, start.path)
+    skipped_updates.check(config, state, start.path)
     done = step >= config.total_steps
     rate = None
     # Check for signals first, so that saving does not wait for an evaluation.

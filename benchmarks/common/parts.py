@@ -32,7 +32,7 @@ Part = tuple[float, float]  # seconds and floor of a part, for all worlds
 
 
 def random_policy(state: EnvState, key: Array) -> tuple[Array, Array]:
-  """Draws random actions; a ``rollout.Policy``."""
+  """Draws random actions; a ``rollout.WorldPolicy``."""
   worlds = state.elapsed.shape[0]
   return random_actions(key, worlds), jnp.zeros(worlds)
 

@@ -14,8 +14,8 @@ import pytest
 
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.errors import UserError
-from apnpql_jax.runs import run_folder, text, versions
-from apnpql_jax.runs.versions import changed_versions
+from apnpql_jax.runs import provenance, run_folder, text
+from apnpql_jax.runs.provenance import changed_versions
 
 CONFIG = TrainConfig(env=EnvConfig(worlds=64), seed=3)
 
@@ -48,17 +48,17 @@ def test_git_commit_is_that_of_the_package_and_of_nobody_else(tmp_path: Path):
   package = tmp_path / "package"
   package.mkdir()
   (package / "__init__.py").write_text("a = 1\n")
-  assert versions._git(package) is None
+  assert provenance._git(package) is None
   git("init", "-q")
   # Installed inside a repository that does not track it.
   git("commit", "-q", "--allow-empty", "-m", "other")
-  assert versions._git(package) is None
+  assert provenance._git(package) is None
   git("add", "package")
   git("commit", "-q", "-m", "mine")
   commit = git("rev-parse", "HEAD")
-  assert versions._git(package) == {"commit": commit, "dirty": False}
+  assert provenance._git(package) == {"commit": commit, "dirty": False}
   (package / "__init__.py").write_text("a = 2\n")
-  assert versions._git(package) == {"commit": commit, "dirty": True}
+  assert provenance._git(package) == {"commit": commit, "dirty": True}
 
 
 def test_changed_versions_are_listed(tmp_path: Path):

@@ -26,7 +26,7 @@ from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.errors import UserError
 from apnpql_jax.runs import checkpoint_reader, leaves, run_folder
 from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
-from apnpql_jax.training import faults, resume
+from apnpql_jax.training import resume, skipped_updates
 from apnpql_jax.training.expert import collect_expert, empty_expert
 from apnpql_jax.training.iteration import make_iteration, make_sample
 from apnpql_jax.training.state import TrainState, initial_state
@@ -297,11 +297,11 @@ def test_after_several_skipped_updates_the_run_stops_and_they_can_be_repeated(
   built, iteration, state, tmp_path: Path, capsys
 ):
   run = run_folder.create(tmp_path / "run", built.config).path
-  faults.check(built.config, state, run)
+  skipped_updates.check(built.config, state, run)
   assert not (run / "faults").exists()
   after, _ = iteration(_poison_replay(state))
   with pytest.raises(errors.RunStopped, match="2 updates in a row") as stop:
-    faults.check(built.config, after, run)
+    skipped_updates.check(built.config, after, run)
   assert stop.value.code == errors.FAILED
   (file,) = (run / "faults").iterdir()
   # The message ends with a command that works verbatim.
@@ -314,7 +314,7 @@ def test_after_several_skipped_updates_the_run_stops_and_they_can_be_repeated(
   arrays: dict[str, Any] = dict(np.load(file, allow_pickle=False))
   zeros = {k: np.zeros_like(x) for k, x in arrays.items() if "/reward" in k}
   np.savez(file, **(arrays | zeros))
-  assert not any(faults.repeat(file).values())
+  assert not any(skipped_updates.repeat(file).values())
   np.savez(file, **{k: v for k, v in arrays.items() if k != "key"})
   with pytest.raises(UserError, match="not an update of this run: 'key'"):
-    faults.repeat(file)
+    skipped_updates.repeat(file)
