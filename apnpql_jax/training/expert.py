@@ -22,24 +22,20 @@ from apnpql_jax.sim import physics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.training.placement import place
-from apnpql_jax.training.rollout import expert_policy, rollout
-from apnpql_jax.types import ACTION_DIM, Array, Slot
+from apnpql_jax.training.rollout import (
+  add_chunk,
+  example_slot,
+  expert_policy,
+  rollout,
+)
+from apnpql_jax.types import Array, Slot
 
-ExpertReplay = Callable[[TrainConfig, Env, Array], Replay | None]
+ExpertReplayMaker = Callable[[TrainConfig, Env, Array], Replay | None]
+"""(settings, worlds, key) -> expert replay, or None if it has no slots."""
 
 CERTAIN = 100.0
 """Log density in nats of actions of an unknown policy: so high that Retrace cuts the
 trace."""
-
-
-def example_slot(worlds: EnvState) -> Slot:
-  """Returns the shapes and dtypes of a replay slot of one world."""
-  action: Any = jax.ShapeDtypeStruct((ACTION_DIM,), jnp.float32)
-  log_prob: Any = jax.ShapeDtypeStruct((), jnp.float32)
-  timestep = jax.tree.map(
-    lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), worlds.timestep
-  )
-  return Slot(timestep=timestep, action=action, log_prob=log_prob)
 
 
 def empty_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:
@@ -66,16 +62,6 @@ def collect_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:
     return place(add_chunk(ring, state, after, chunk), env.mesh)
 
   return collect(env.reset(rows), play_key)
-
-
-def add_chunk(ring: Replay, before: EnvState, after: EnvState, chunk: Slot) -> Replay:
-  """Adds a chunk [time, worlds, ...] to a replay.
-
-  In worlds that became non-finite, excludes it and the episode before from sampling.
-  """
-  steps = before.elapsed + chunk.action.shape[0]
-  broken = after.faults > before.faults
-  return replay.exclude(replay.add(ring, chunk), jnp.where(broken, steps, 0))
 
 
 def replay_from_demonstrations(

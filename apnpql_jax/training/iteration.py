@@ -14,9 +14,8 @@ from apnpql_jax.agents.learner import Agent
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.data import replay
 from apnpql_jax.envs.env import Env
-from apnpql_jax.training.expert import add_chunk
 from apnpql_jax.training.placement import place
-from apnpql_jax.training.rollout import agent_policy, rollout
+from apnpql_jax.training.rollout import add_chunk, agent_policy, rollout
 from apnpql_jax.training.state import SkippedUpdates, TrainState
 from apnpql_jax.types import Metrics, Transition
 

@@ -1,4 +1,4 @@
-"""Rollouts of policies: loops over time, batched over worlds."""
+"""Rollouts of policies: loops over time, batched over worlds, into the replay."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ import jax.numpy as jnp
 
 from apnpql_jax.agents.learner import Agent
 from apnpql_jax.agents.networks import Params
+from apnpql_jax.data import replay
+from apnpql_jax.data.replay import Replay
 from apnpql_jax.envs.env import Env
 from apnpql_jax.envs.state import EnvState
 from apnpql_jax.sim.physics import PhysicsState
-from apnpql_jax.types import ARM_DOF, Array, Slot
+from apnpql_jax.types import ACTION_DIM, ARM_DOF, Array, Slot
 
 WorldPolicy = Callable[[EnvState, Array], tuple[Array, Array]]
 """(worlds, key) -> actions f32[worlds, 7], log densities f32[worlds]."""
@@ -71,6 +73,26 @@ def rollout(
     return env.step(state, action, env_key), slot
 
   return jax.lax.scan(period, state, jax.random.split(key, length))
+
+
+def example_slot(worlds: EnvState) -> Slot:
+  """Returns the shapes and dtypes of a replay slot of one world."""
+  action: Any = jax.ShapeDtypeStruct((ACTION_DIM,), jnp.float32)
+  log_prob: Any = jax.ShapeDtypeStruct((), jnp.float32)
+  timestep = jax.tree.map(
+    lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), worlds.timestep
+  )
+  return Slot(timestep=timestep, action=action, log_prob=log_prob)
+
+
+def add_chunk(ring: Replay, before: EnvState, after: EnvState, chunk: Slot) -> Replay:
+  """Adds a chunk [time, worlds, ...] to a replay.
+
+  In worlds that became non-finite, excludes it and the episode before from sampling.
+  """
+  steps = before.elapsed + chunk.action.shape[0]
+  broken = after.faults > before.faults
+  return replay.exclude(replay.add(ring, chunk), jnp.where(broken, steps, 0))
 
 
 class Episodes(struct.PyTreeNode):

@@ -12,8 +12,9 @@ from apnpql_jax.data import replay
 from apnpql_jax.data.replay import Replay
 from apnpql_jax.envs.env import Env
 from apnpql_jax.envs.state import EnvState
-from apnpql_jax.training.expert import ExpertReplay, empty_expert, example_slot
+from apnpql_jax.training.expert import ExpertReplayMaker, empty_expert
 from apnpql_jax.training.placement import place, shardings
+from apnpql_jax.training.rollout import example_slot
 from apnpql_jax.types import Array
 
 
@@ -37,7 +38,7 @@ class TrainState(struct.PyTreeNode):
 
 
 def initial_state(
-  config: TrainConfig, env: Env, agent: Agent, expert: ExpertReplay
+  config: TrainConfig, env: Env, agent: Agent, expert: ExpertReplayMaker
 ) -> TrainState:
   """Returns the state of a new run; ``expert`` makes the expert replay."""
   keys = jax.random.split(jax.random.key(config.seed), 5)

@@ -28,7 +28,7 @@ from apnpql_jax.runs.progress import TrainProgress
 from apnpql_jax.runs.signals import Signals
 from apnpql_jax.runs.sinks import check_sinks, make_sinks
 from apnpql_jax.training import expert, skipped_updates
-from apnpql_jax.training.expert import ExpertReplay, collect_expert
+from apnpql_jax.training.expert import ExpertReplayMaker, collect_expert
 from apnpql_jax.training.iteration import make_iteration
 from apnpql_jax.training.reporter import Reporter
 from apnpql_jax.training.resume import restore, set_aside, to_items
@@ -166,7 +166,7 @@ def _start(
   return Start(env, agent, run_folder.open_run(run_dir).path, state, None)
 
 
-def _expert(config: TrainConfig, env: Env) -> ExpertReplay:
+def _expert(config: TrainConfig, env: Env) -> ExpertReplayMaker:
   """Returns how to fill the expert replay: from a file or by the scripted expert."""
   if not config.replay.demonstrations:
     _say("collecting the expert replay")

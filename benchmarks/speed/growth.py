@@ -33,7 +33,7 @@ from apnpql_jax.sim.engines import make_physics
 from apnpql_jax.sim.physics import initial_state
 from apnpql_jax.sim.scene import Scene, load_scene
 from apnpql_jax.tasks import make_task
-from apnpql_jax.training.expert import example_slot
+from apnpql_jax.training.rollout import example_slot
 from benchmarks.common import command, floor, noise, parts, settings, timing
 from benchmarks.speed import env_steps, learner
 
