@@ -28,11 +28,20 @@ from apnpql_jax.types import Array, Metrics, Observation, Transition
 class LearnerState(struct.PyTreeNode):
   """Complete state of the learner."""
 
-  params: Params  # one entry per group that the algorithm has
-  target_params: Params  # moving average of params; these act
-  nu: Float[Array, ""]  # multiplier >= 0 of the entropy floor
-  opt_state: Any  # of one Adam per learning rate
-  step: Int[Array, ""]  # updates done
+  params: Params
+  """Parameters, one entry per group that the algorithm has."""
+
+  target_params: Params
+  """Moving average of ``params``; these act."""
+
+  nu: Float[Array, ""]
+  """Multiplier >= 0 of the entropy floor."""
+
+  opt_state: Any
+  """State of one Adam per learning rate."""
+
+  step: Int[Array, ""]
+  """Number of updates done."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,17 +49,26 @@ class Agent:
   """Pure functions of one configuration; all can be jitted, scanned and sharded."""
 
   networks: Networks
+  """The networks, without parameters."""
+
   policy_evaluation: PolicyEvaluation
-  # (key, example observation with a batch axis) -> state before learning.
+  """How the algorithm represents and learns values."""
+
   init: Callable[[PRNGKeyArray, Observation], LearnerState]
-  # (params, observation [B], key, greedy) -> actions f32[B, 7], info f32[B] each: the
-  # action's log_prob, which Retrace needs, and for diagnosis its q, the candidates'
-  # q_max and ess, and alpha. ``greedy`` is a Python bool.
+  """(key, example observation with a batch axis) -> state before learning."""
+
   act: Callable[[Params, Observation, PRNGKeyArray, bool], tuple[Array, Metrics]]
-  # (state, transitions [B], key) -> state after one update, metrics f32[].
+  """(params, observation [B], key, greedy) -> actions f32[B, 7], info f32[B] each.
+
+  ``info`` holds the action's ``log_prob``, which Retrace needs, and for diagnosis its
+  ``q``, the candidates' ``q_max`` and ``ess``, and ``alpha``. ``greedy`` is a Python
+  bool.
+  """
+
   update: Callable[
     [LearnerState, Transition, PRNGKeyArray], tuple[LearnerState, Metrics]
   ]
+  """(state, transitions [B], key) -> state after one update, metrics f32[]."""
 
 
 def make_agent(config: AgentConfig) -> Agent:
