@@ -57,19 +57,17 @@ class CheckpointWriter:
 
   def save(
     self, step: int, items: Mapping[str, Any], *, success_rate: float | None = None
-  ) -> bool:
+  ) -> None:
     """Starts writing ``items``; they may be donated as soon as this returns.
 
-    Waits for the previous save first. On a CPU, JAX replaces donated buffers that are
-    still being read, which takes memory for a second state.
+    Waits for the previous save first. Does nothing if this step has already been saved.
+    On a CPU, JAX replaces donated buffers that are still being read, which takes memory
+    for a second state.
 
     Args:
       step: environment steps done.
       items: name -> pytree of arrays, including typed PRNG keys.
       success_rate: decides which checkpoint is the best; None if not evaluated.
-
-    Returns:
-      False, without writing, if this step has already been saved.
 
     Raises:
       SaveError: this save cannot be started, or the previous one failed.
@@ -79,7 +77,7 @@ class CheckpointWriter:
 
     self.wait()
     if step in self._manager.all_steps():
-      return False
+      return
     self._saving = step, time.monotonic()
     record = checkpoint_record.describe(self._config, items, success_rate)
     parts: dict[str, Any] = {"meta": ocp.args.JsonSave(record)}
@@ -90,7 +88,7 @@ class CheckpointWriter:
       parts[name] = ocp.args.StandardSave(plain, save_args=args)
     self._policy.rates[step], self._policy.items[step] = success_rate, set(items)
     try:
-      return self._manager.save(step, args=ocp.args.Composite(**parts), force=True)
+      self._manager.save(step, args=ocp.args.Composite(**parts), force=True)
     except Exception as error:
       raise self._failed(error) from error
 

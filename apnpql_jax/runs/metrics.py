@@ -166,17 +166,15 @@ def read_rows(path: Path, *, having: str = "") -> list[Row]:
   return rows
 
 
-def plot_curve(rows: Sequence[Row], path: Path, *, title: str = "") -> bool:
+def plot_curve(rows: Sequence[Row], path: Path, *, title: str = "") -> None:
   """Draws the success rate over environment steps and over wall-clock minutes.
 
-  The band is the 95 % interval, for rows that hold the number of episodes.
-
-  Returns:
-    False, without drawing, if no row is an evaluation.
+  The band is the 95 % interval, for rows that hold the number of episodes. Draws
+  nothing if no row is an evaluation.
   """
   rows = [row for row in rows if row.get(SUCCESS) is not None]
   if not rows:
-    return False
+    return
   # Not pyplot, which would choose a display for the whole process.
   from matplotlib.backends.backend_agg import FigureCanvasAgg
   from matplotlib.figure import Figure
@@ -200,7 +198,6 @@ def plot_curve(rows: Sequence[Row], path: Path, *, title: str = "") -> bool:
   part = path.with_name(path.name + ".part")
   figure.savefig(part, dpi=120, format="png")
   part.replace(path)
-  return True
 
 
 def _interval(row: Row) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from pathlib import Path
 import shutil
 from typing import NamedTuple
 
-from apnpql_jax.config import codec, files
+from apnpql_jax.config import files
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import ConfigError, FileError, UserError
 from apnpql_jax.runs.provenance import describe_versions
@@ -88,7 +88,7 @@ def new_run_dir(preset: str, root: Path = Path("runs")) -> Path:
 
 
 def load_run_config(
-  run_dir: Path, warn: Callable[[str], None] = codec.ignore
+  run_dir: Path, warn: Callable[[str], None] | None = None
 ) -> TrainConfig:
   """Returns the configuration that a run was started with.
 
@@ -103,9 +103,13 @@ def load_run_config(
       f"{str(run_dir)!r} is not a run folder (no {CONFIG_FILE}); "
       f"{_nearby_runs(run_dir)}"
     )
+
+  def report(line: str) -> None:
+    if warn:
+      warn(f"{path} is {line}")
+
   try:
-    text = read_text(path, _MAX_CONFIG_BYTES)
-    return files.config_from_json(text, lambda line: warn(f"{path} is {line}"))
+    return files.config_from_json(read_text(path, _MAX_CONFIG_BYTES), report)
   except UserError as error:
     raise FileError(f"{path}: {error}") from None
   except (OSError, ValueError) as error:

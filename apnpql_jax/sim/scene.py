@@ -34,7 +34,6 @@ class Scene:
   gripper_qpos: int  # address of the driven finger joint in qpos
   gripper_dof: int  # the same in qvel
   tool_site: int  # id of the site between the closed finger tips
-  cameras: tuple[str, ...]  # names of all cameras
   variants: dict[str, np.ndarray]  # differing model fields, f32[variants, ...]
 
   def id(self, kind: str, name: str) -> int:
@@ -91,7 +90,6 @@ def load_scene(
     gripper_qpos=int(model.jnt_qposadr[finger]),
     gripper_dof=int(model.jnt_dofadr[finger]),
     tool_site=_named_id(model, path.stem, "site", TOOL_SITE),
-    cameras=tuple(model.camera(i).name for i in range(model.ncam)),
     variants=_differences(models),
   )
 
