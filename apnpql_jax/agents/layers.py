@@ -6,7 +6,9 @@ from collections.abc import Sequence
 
 from flax import linen as nn
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+from apnpql_jax.types import Array
 
 _small = nn.initializers.variance_scaling(1e-4, "fan_in", "truncated_normal")
 

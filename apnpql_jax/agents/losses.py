@@ -14,11 +14,12 @@ import math
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 import optax
 
 from apnpql_jax.dists import categorical
 from apnpql_jax.dists.action import ActionDistribution
+from apnpql_jax.types import Array
 
 
 def weighted_mean(

@@ -13,7 +13,7 @@ from typing import Any
 from flax import struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Int, PRNGKeyArray
 import numpy as np
 
 from apnpql_jax.types import Array, Slot, Transition
@@ -91,7 +91,7 @@ def can_sample(replay: Replay, *, n_step: int) -> Bool[Array, ""]:
 
 def sample(
   replay: Replay,
-  key: Array,
+  key: PRNGKeyArray,
   *,
   batch_size: int,
   n_step: int,
@@ -149,7 +149,7 @@ def expert_count(batch_size: int, expert_share: float) -> int:
 def sample_mixed(
   agent_replay: Replay,
   expert_replay: Replay | None,
-  key: Array,
+  key: PRNGKeyArray,
   *,
   batch_size: int,
   expert_share: float,
@@ -179,7 +179,7 @@ def sample_mixed(
 
 
 def _draw_starts(
-  replay: Replay, key: Array, batch_size: int, n_step: int, before: int
+  replay: Replay, key: PRNGKeyArray, batch_size: int, n_step: int, before: int
 ) -> tuple[Array, Array, Array]:
   """Draws starts by rejection: time index, world and validity, each [B].
 

@@ -173,7 +173,7 @@ class Env:
     """Repeats L times, [worlds, ...] -> [worlds, L, ...]."""
     return jnp.repeat(x[:, None], self._instants, axis=1)
 
-  def _initial(self, rows: Array, keys: Array) -> PhysicsState:
+  def _initial(self, rows: Array, keys: PRNGKeyArray) -> PhysicsState:
     """Returns worlds at rest at rows of the bank, randomized if configured."""
     bank = self._bank
     drawn = bank.qpos, bank.mocap_pos, bank.mocap_quat, bank.variant

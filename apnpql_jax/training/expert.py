@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
 import numpy as np
 
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
@@ -30,7 +31,7 @@ from apnpql_jax.training.rollout import (
 )
 from apnpql_jax.types import Array, Slot
 
-ExpertReplayMaker = Callable[[TrainConfig, Env, Array], Replay | None]
+ExpertReplayMaker = Callable[[TrainConfig, Env, PRNGKeyArray], Replay | None]
 """(settings, worlds, key) -> expert replay, or None if it has no slots."""
 
 CERTAIN = 100.0
@@ -38,7 +39,7 @@ CERTAIN = 100.0
 trace."""
 
 
-def empty_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:
+def empty_expert(config: TrainConfig, env: Env, key: PRNGKeyArray) -> Replay | None:
   """Returns an empty expert replay, to get its shapes."""
   del key
   worlds, length = config.env.worlds, _length(config)
@@ -46,7 +47,7 @@ def empty_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:
   return replay.create(example_slot(state), length, worlds) if length else None
 
 
-def collect_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:
+def collect_expert(config: TrainConfig, env: Env, key: PRNGKeyArray) -> Replay | None:
   """Returns an expert replay of noisy episodes of the scripted expert."""
   worlds, length = config.env.worlds, _length(config)
   if not length:
@@ -56,7 +57,7 @@ def collect_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:
   rows = jax.random.randint(row_key, (worlds,), 0, env.bank_split)
 
   @jax.jit
-  def collect(state: EnvState, key: Array) -> Replay:
+  def collect(state: EnvState, key: PRNGKeyArray) -> Replay:
     after, chunk = rollout(env, policy, state, key, length=length)
     ring = replay.create(example_slot(state), length, worlds)
     return place(add_chunk(ring, state, after, chunk), env.mesh)
@@ -123,8 +124,8 @@ def record_expert(
   rows = jax.random.randint(row_key, (episodes,), 0, env.bank_split)
 
   @jax.jit
-  def play(start: EnvState, key: Array):
-    def period(state: EnvState, key: Array):
+  def play(start: EnvState, key: PRNGKeyArray) -> Any:
+    def period(state: EnvState, key: PRNGKeyArray) -> tuple[EnvState, Any]:
       policy_key, env_key = jax.random.split(key)
       action, _ = policy(state, policy_key)
       after = env.step(state, action, env_key)

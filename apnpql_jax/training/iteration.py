@@ -9,17 +9,22 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import PRNGKeyArray
 
-from apnpql_jax.agents.learner import Agent
+from apnpql_jax.agents.learner import Agent, LearnerState
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.data import replay
+from apnpql_jax.data.replay import Replay
 from apnpql_jax.envs.env import Env
 from apnpql_jax.training.placement import place
 from apnpql_jax.training.rollout import add_chunk, agent_policy, rollout
 from apnpql_jax.training.state import SkippedUpdates, TrainState
-from apnpql_jax.types import Metrics, Transition
+from apnpql_jax.types import Array, Metrics, Transition
 
 Iteration = Callable[[TrainState], tuple[TrainState, Metrics]]
+
+Sample = Callable[..., Transition]
+"""(replay, expert replay, key) -> batch [B, ...] of an update."""
 
 
 def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
@@ -64,7 +69,14 @@ def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
   return jax.jit(iteration, donate_argnums=0)
 
 
-def _update(agent, sample, ring, expert_replay, carry, key) -> Any:
+def _update(
+  agent: Agent,
+  sample: Sample,
+  ring: Replay,
+  expert_replay: Replay | None,
+  carry: tuple[LearnerState, SkippedUpdates],
+  key: PRNGKeyArray,
+) -> tuple[tuple[LearnerState, SkippedUpdates], tuple[Metrics, Array]]:
   """Runs one update inside ``scan``; skips and counts it if it is not finite."""
   learner, faults = carry
   sample_key, learn_key = jax.random.split(key)
@@ -83,10 +95,8 @@ def _update(agent, sample, ring, expert_replay, carry, key) -> Any:
   return (learner, faults), (metrics, ok)
 
 
-def make_sample(
-  config: TrainConfig, agent: Agent, mesh: Mesh | None = None
-) -> Callable[..., Transition]:
-  """Returns a function (replay, expert replay, key) -> batch [B, ...] of an update."""
+def make_sample(config: TrainConfig, agent: Agent, mesh: Mesh | None = None) -> Sample:
+  """Returns a function that draws the batch of an update."""
   draw = functools.partial(
     replay.sample_mixed,
     batch_size=config.replay.batch_size,

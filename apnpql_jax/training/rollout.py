@@ -8,6 +8,7 @@ from typing import Any
 from flax import struct
 import jax
 import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
 
 from apnpql_jax.agents.learner import Agent
 from apnpql_jax.agents.networks import Params
@@ -18,7 +19,7 @@ from apnpql_jax.envs.state import EnvState
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.types import ACTION_DIM, ARM_DOF, Array, Slot
 
-WorldPolicy = Callable[[EnvState, Array], tuple[Array, Array]]
+WorldPolicy = Callable[[EnvState, PRNGKeyArray], tuple[Array, Array]]
 """(worlds, key) -> actions f32[worlds, 7], log densities f32[worlds]."""
 
 FILMED = 4
@@ -31,7 +32,7 @@ _LEAST_NOISE = 1e-6
 def agent_policy(agent: Agent, params: Params, *, greedy: bool) -> WorldPolicy:
   """Returns the learned policy, which depends on observations only."""
 
-  def policy(state: EnvState, key: Array) -> tuple[Array, Array]:
+  def policy(state: EnvState, key: PRNGKeyArray) -> tuple[Array, Array]:
     action, info = agent.act(params, state.observation, key, greedy)
     return action, info["log_prob"]
 
@@ -44,7 +45,7 @@ def expert_policy(env: Env, *, noise: float) -> WorldPolicy:
   ``noise`` is its standard deviation in rad/s.
   """
 
-  def policy(state: EnvState, key: Array) -> tuple[Array, Array]:
+  def policy(state: EnvState, key: PRNGKeyArray) -> tuple[Array, Array]:
     action = env.expert_action(state)
     mean = action[..., :ARM_DOF]
     velocity = (mean + noise * jax.random.normal(key, mean.shape)).clip(-1.0, 1.0)
@@ -58,7 +59,7 @@ def expert_policy(env: Env, *, noise: float) -> WorldPolicy:
 
 
 def rollout(
-  env: Env, policy: WorldPolicy, state: EnvState, key: Array, *, length: int
+  env: Env, policy: WorldPolicy, state: EnvState, key: PRNGKeyArray, *, length: int
 ) -> tuple[EnvState, Slot]:
   """Plays ``length`` control periods in every world, episode after episode.
 
@@ -66,7 +67,7 @@ def rollout(
     The worlds afterwards, and the slots with leaves [length, worlds, ...].
   """
 
-  def period(state: EnvState, key: Array) -> tuple[EnvState, Slot]:
+  def period(state: EnvState, key: PRNGKeyArray) -> tuple[EnvState, Slot]:
     policy_key, env_key = jax.random.split(key)
     action, log_prob = policy(state, policy_key)
     slot = Slot(timestep=state.timestep, action=action, log_prob=log_prob)
@@ -103,7 +104,7 @@ class Episodes(struct.PyTreeNode):
   states: PhysicsState  # [time, <= FILMED, ...]: time steps 0 to ``length``
 
 
-Player = Callable[[Any, Array, Array], Episodes]
+Player = Callable[[Any, Array, PRNGKeyArray], Episodes]
 """(parameters of the policy, bank rows i32[worlds], key) -> episodes."""
 
 
@@ -114,7 +115,7 @@ def make_player(env: Env, make_policy: Callable[[Any], WorldPolicy]) -> Player:
   """
 
   @jax.jit
-  def play(params: Any, rows: Array, key: Array) -> Episodes:
+  def play(params: Any, rows: Array, key: PRNGKeyArray) -> Episodes:
     policy = make_policy(params)
 
     def step(carry):

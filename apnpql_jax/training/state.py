@@ -5,6 +5,7 @@ from __future__ import annotations
 from flax import struct
 import jax
 import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
 
 from apnpql_jax.agents.learner import Agent, LearnerState
 from apnpql_jax.config.schema import TrainConfig
@@ -22,7 +23,7 @@ class SkippedUpdates(struct.PyTreeNode):
   """Updates skipped because they were not finite."""
 
   in_a_row: Array  # i32[]: consecutive ones, up to now
-  key: Array  # typed PRNG key of the last one, to repeat it
+  key: PRNGKeyArray  # typed PRNG key of the last one, to repeat it
 
 
 class TrainState(struct.PyTreeNode):
@@ -32,7 +33,7 @@ class TrainState(struct.PyTreeNode):
   env: EnvState  # [worlds, ...]
   replay: Replay
   expert_replay: Replay | None
-  key: Array  # typed PRNG key
+  key: PRNGKeyArray  # typed PRNG key
   env_steps: Array  # i32[]: environment steps done, summed over worlds
   faults: SkippedUpdates
 
@@ -47,7 +48,7 @@ def initial_state(
 
   @jax.jit
   def start(
-    worlds: EnvState, key: Array, init_key: Array, fault_key: Array
+    worlds: EnvState, key: PRNGKeyArray, init_key: PRNGKeyArray, fault_key: PRNGKeyArray
   ) -> TrainState:
     length = config.replay.capacity // config.env.worlds
     state = TrainState(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
 
 from apnpql_jax.agents.columns.candidates import Candidates, clip_action
 from apnpql_jax.agents.networks import Heads
@@ -24,7 +25,7 @@ CEM_MIN_STD = 0.01  # rad/s; floor of the elites' deviation, to keep draws apart
 def non_parametric(
   heads: Heads,
   prior: ActionDistribution,
-  key: Array,
+  key: PRNGKeyArray,
   *,
   num_samples: int,
   greedy: bool = False,
@@ -45,7 +46,7 @@ def non_parametric(
 def parametric(
   heads: Heads,
   prior: ActionDistribution,
-  key: Array,
+  key: PRNGKeyArray,
   *,
   num_samples: int,
   greedy: bool = False,
@@ -75,7 +76,7 @@ def parametric(
 def cem(
   heads: Heads,
   prior: ActionDistribution,
-  key: Array,
+  key: PRNGKeyArray,
   *,
   num_samples: int,
   greedy: bool = False,
