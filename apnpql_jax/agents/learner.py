@@ -75,7 +75,7 @@ def make_agent(config: AgentConfig) -> Agent:
   """Builds the agent that ``config`` describes.
 
   Raises:
-    ConfigError: for an unknown algorithm or settings that cannot work.
+    ConfigError: The algorithm is unknown, or the settings cannot work.
   """
   validate(TrainConfig(agent=config), algorithms=epsilon_bounds())
   algorithm = algorithm_of(config)
@@ -125,7 +125,7 @@ def make_agent(config: AgentConfig) -> Agent:
     nu = jnp.maximum(params.pop("nu"), 0.0)
     metrics |= {f"grad_norm/{k}": optax.tree.norm(grads[k]) for k in groups}
     metrics["prior/nu"] = nu
-    # Move the target network towards the new parameters.
+    # Move the target network toward the new parameters.
     rate = config.target_rate
     target_params = jax.tree.map(
       lambda new, old: old + rate * (new - old), params, state.target_params

@@ -30,7 +30,7 @@ def mixture_from_outputs(
 
   Each row of a Cholesky factor is a direction times the standard deviation of that
   joint (rad/s), ``initial_std`` for outputs of zero, within limits. Because the means
-  are fixed, a value that rises towards one side can make every M-step widen the
+  are fixed, a value that rises toward one side can make every M-step widen the
   component, until most candidates are far from every primitive and their values are
   guesses. Gripper commands keep a probability of ``min_prob``, and so do components
   while one of the others is at its limit, because q cannot evaluate actions that the
@@ -91,8 +91,8 @@ def _forward(x: Array, low: float, high: float) -> tuple[Array, Array]:
 
 def _backward(low: float, high: float, x: Array, grad: Array) -> tuple[Array]:
   # Descent moves x against the gradient: a negative one pushes it up.
-  outwards = ((x >= high) & (grad < 0)) | ((x <= low) & (grad > 0))
-  return (jnp.where(outwards, 0.0, grad),)
+  outward = ((x >= high) & (grad < 0)) | ((x <= low) & (grad > 0))
+  return (jnp.where(outward, 0.0, grad),)
 
 
 one_way_clip.defvjp(_forward, _backward)

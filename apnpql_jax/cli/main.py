@@ -24,7 +24,7 @@ from apnpql_jax.runs.signals import Signals
 def main(argv: Sequence[str] | None = None) -> int:
   """Runs one command line and returns its exit code.
 
-  0 is success, 2 bad input, 3 a run that had to stop (disk full, values not finite),
+  0 is success, 2 bad input, 3 a run that had to stop (disk full, non-finite updates),
   130 Ctrl-C and 143 SIGTERM, with the run saved. All but 0 print one line to stderr.
   """
   runtime.configure()

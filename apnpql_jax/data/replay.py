@@ -26,7 +26,7 @@ class Replay(struct.PyTreeNode):
 
   slots: Slot  # [length, worlds, ...]
   cursor: Int[Array, ""]  # next time index to write; the oldest one once full
-  size: Int[Array, ""]  # stored time steps, at most length
+  size: Int[Array, ""]  # stored instants per world, at most length
 
 
 def create(example_slot: Slot, length: int, worlds: int) -> Replay:
@@ -39,14 +39,14 @@ def create(example_slot: Slot, length: int, worlds: int) -> Replay:
 
 
 def add(replay: Replay, chunk: Slot) -> Replay:
-  """Writes a chunk [T, worlds, ...], oldest first, over the oldest time steps.
+  """Writes a chunk [T, worlds, ...], oldest first, over the oldest instants.
 
   All chunks of a ring have the same T, so no write crosses its end. The write is in
   place if the replay is donated and is sampled only afterwards.
   """
   length, steps = replay.slots.action.shape[0], chunk.action.shape[0]
   if not steps or length % steps:
-    raise ValueError(f"a chunk of {steps} steps does not divide {length} time steps")
+    raise ValueError(f"a chunk of {steps} instants does not divide a ring of {length}")
 
   def write(ring: Array, new: Array) -> Array:
     expected = (steps, *ring.shape[1:])

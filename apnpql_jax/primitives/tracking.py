@@ -28,7 +28,7 @@ MAX_REFINEMENT = 0.3  # rad; longest joint step, a trust region near singulariti
 def follow(
   target: Float[Array, "*b 6"], q: Float[Array, "*b 6"]
 ) -> Float[Array, "*b 6"]:
-  """Returns velocities (rad/s) towards joint angles; one factor scales all joints."""
+  """Returns velocities (rad/s) toward joint angles; one factor scales all joints."""
   error = target - q
   farthest = jnp.abs(error).max(-1, keepdims=True)
   speed = jnp.minimum(GAIN * farthest, jnp.sqrt(2 * BRAKING * farthest))
@@ -43,7 +43,7 @@ def refine(
   pos: Float[Array, "*b 3"],
   mat: Float[Array, "*b 3 3"],
 ) -> Float[Array, "*b 6"]:
-  """Moves joint targets (rad) towards tool poses by damped least squares.
+  """Moves joint targets (rad) toward tool poses by damped least squares.
 
   Starts from the last target, or from the present configuration if that is nearer to
   the pose. After a jump of the pose, as when an object has been grasped, steps from a

@@ -101,7 +101,7 @@ class CameraSpec:
 class Lighting:
   """Ambient light, one directional light, background and shadows.
 
-  Intensity on a surface with unit normal n, where l points towards the light, is
+  Intensity on a surface with unit normal n, where l points toward the light, is
   ``ambient + diffuse * max(n.l, -fill * n.l)``; without ``fill`` all surfaces that face
   away would have one flat color. Seen from the light, every shadow receiver must lie
   behind every caster, as a table lies under a gripper. No casters, no cost.

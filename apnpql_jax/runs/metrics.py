@@ -83,7 +83,7 @@ class MetricWriter:
   def write(self, step: int, metrics: Mapping[str, Any]) -> None:
     """Adds a row of numbers or arrays of one element.
 
-    Values that are not finite become null in the file.
+    Non-finite values become null in the file.
     """
     numbers = {name: _number(value) for name, value in metrics.items()}
     row: Row = {STEP: step, WALL: round(self._clock() - self._start, 3), **numbers}

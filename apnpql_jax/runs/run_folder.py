@@ -152,7 +152,7 @@ def lock(run_dir: Path, *, shared: bool = False) -> Generator[None, None, None]:
       kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
       fcntl.flock(folder, kind | fcntl.LOCK_NB)
     except BlockingIOError:
-      raise FileError(f"{str(run_dir)!r} is trained by another process") from None
+      raise FileError(f"{str(run_dir)!r} is being trained by another process") from None
     except OSError:  # Some file systems have no locks.
       pass
     yield
@@ -180,7 +180,7 @@ def check_free(run_dir: Path, *, overwrite: bool) -> None:
     return
   if not (run_dir / CONFIG_FILE).is_file():
     raise FileError(
-      f"{str(run_dir)!r} holds something that is not a run; choose another --run"
+      f"{str(run_dir)!r} contains files that are not a run; choose another --run"
     )
   if not overwrite:
     raise FileError(

@@ -5,7 +5,7 @@ Primitives; following any one of them never knocks the plate over:
 
 - object: go above the plate, turn the fingers across it and, through a funnel, go down
   until its edge is between the open pads; stay there.
-- goal: with the plate in hand, lift it and, increasingly with height, move it towards
+- goal: with the plate in hand, lift it and, increasingly with height, move it toward
   the box; turn it across the box's longer side and, through a funnel, lower it to the
   floor. With empty hands, go above the box.
 - neutral: the configuration of the keyframe.

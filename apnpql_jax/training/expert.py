@@ -173,7 +173,7 @@ def _solve_targets(demos: Demonstrations, rows: np.ndarray, env: Env) -> np.ndar
   far = (residuals > [ik.POSITION_TOLERANCE, ik.ROTATION_TOLERANCE]).any((1, 2))
   if far.any():
     raise FileError(
-      f"demonstrations: the arm cannot reach a primitive's target at time step "
+      f"demonstrations: the arm cannot reach a primitive's target at instant "
       f"{unique[far.argmax()]}"
     )
   return targets.astype(np.float32)[inverse]

@@ -77,7 +77,7 @@ def _update(
   carry: tuple[LearnerState, SkippedUpdates],
   key: PRNGKeyArray,
 ) -> tuple[tuple[LearnerState, SkippedUpdates], tuple[Metrics, Array]]:
-  """Runs one update inside ``scan``; skips and counts it if it is not finite."""
+  """Runs one update inside ``scan``; skips and counts it if it is non-finite."""
   learner, faults = carry
   sample_key, learn_key = jax.random.split(key)
   batch = sample(ring, expert_replay, sample_key)

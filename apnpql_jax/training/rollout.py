@@ -101,7 +101,7 @@ class Episodes(struct.PyTreeNode):
 
   success: Array  # bool[worlds]
   length: Array  # i32[worlds]: control periods until success or time-out
-  states: PhysicsState  # [time, <= FILMED, ...]: time steps 0 to ``length``
+  states: PhysicsState  # [time, <= FILMED, ...]: instants 0 to ``length``
 
 
 Player = Callable[[Any, Array, PRNGKeyArray], Episodes]

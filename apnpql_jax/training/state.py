@@ -20,7 +20,7 @@ from apnpql_jax.types import Array
 
 
 class SkippedUpdates(struct.PyTreeNode):
-  """Updates skipped because they were not finite."""
+  """Record of the non-finite updates, which are skipped."""
 
   in_a_row: Array  # i32[]: consecutive ones, up to now
   key: PRNGKeyArray  # typed PRNG key of the last one, to repeat it

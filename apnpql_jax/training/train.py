@@ -173,7 +173,8 @@ def _expert(config: TrainConfig, env: Env) -> ExpertReplayMaker:
     return collect_expert
   path = Path(config.replay.demonstrations)
   demos = demonstrations.load(path, env.task, env.config.control_period_s)
-  _say(f"{demos.instants} time steps of {path} for {config.replay.expert_steps} slots")
+  slots = config.replay.expert_steps
+  _say(f"expert replay: {demos.instants} instants of {path} fill {slots} slots")
   return lambda config, env, _: expert.replay_from_demonstrations(demos, config, env)
 
 

@@ -179,7 +179,7 @@ def test_other_files_are_refused_by_name(path, demos, env):
   np.savez(path, format=demonstrations.FORMAT, version=2)
   with pytest.raises(UserError, match="lacks arrays or has extra ones: action"):
     demonstrations.load(path, env.task, env.config.control_period_s)
-  with pytest.raises(UserError, match="no archive"):
+  with pytest.raises(UserError, match="not an .npz archive"):
     demonstrations.load(path.with_name("none"), env.task, env.config.control_period_s)
 
 

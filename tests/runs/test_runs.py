@@ -90,7 +90,7 @@ def test_a_run_that_is_trained_is_left_alone(tmp_path):
       lambda: run_folder.check_free(run, overwrite=True),
       lambda: run_folder.lock(run).__enter__(),
     ):
-      with pytest.raises(UserError, match="run' is trained by another process"):
+      with pytest.raises(UserError, match="run' is being trained by another process"):
         refused()
     run_folder.load_run_config(run)
   run_folder.check_resumable(run, TrainConfig())

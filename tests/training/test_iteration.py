@@ -202,7 +202,7 @@ def test_a_state_saved_without_replay_continues_with_an_older_one(
   example = jax.eval_shape(lambda: jax.tree.map(jnp.copy, after))
   warnings: list[str] = []
   restored = resume.restore(built.config, tmp_path, example, warnings.append)
-  assert warnings == ["its replay is that of step 24"]
+  assert warnings == ["its replay comes from step 24"]
   assert _bits(restored.replace(replay=None)) == _bits(after.replace(replay=None))
   assert int(restored.replay.cursor) == int(before.replay.cursor)
   # The next slots do not continue the newest one, which is now marked as an end.
@@ -300,7 +300,7 @@ def test_after_several_skipped_updates_the_run_stops_and_they_can_be_repeated(
   skipped_updates.check(built.config, state, run)
   assert not (run / "faults").exists()
   after, _ = iteration(_poison_replay(state))
-  with pytest.raises(errors.RunStopped, match="2 updates in a row") as stop:
+  with pytest.raises(errors.RunStopped, match="2 consecutive updates") as stop:
     skipped_updates.check(built.config, after, run)
   assert stop.value.code == errors.FAILED
   (file,) = (run / "faults").iterdir()

@@ -68,18 +68,18 @@ def test_a_run_killed_at_random_times_ends_like_an_undisturbed_one(tmp_path, kil
 
   # During compilation there is nothing to save, so a signal ends the process at once.
   process = testing.start(
-    run, *FOR_EVER, "--replay.demonstrations", str(demos), said=said
+    run, *FOR_EVER, "--replay.demonstrations", str(demos), log=said
   )
   _wait(process, said, "compiling")
   process.send_signal(signal.SIGINT)
   assert process.wait(30) == 128 + signal.SIGINT
   *_, before, last = said.read_text().splitlines()
   assert "compiling" in before and last.startswith("apnpql: stopped before the first")
-  assert f"16 time steps of {demos} for 32 slots" in said.read_text()
+  assert f"16 instants of {demos} fill 32 slots" in said.read_text()
 
   lost, saving = [], 0
   for _ in range(kills):
-    process = testing.start(run, *FOR_EVER, said=said)
+    process = testing.start(run, *FOR_EVER, log=said)
     _wait(process, said)
     time.sleep(rng.uniform(0.0, 3.0))
     process.kill()
@@ -97,7 +97,7 @@ def test_a_run_killed_at_random_times_ends_like_an_undisturbed_one(tmp_path, kil
   assert max(lost) <= 2 * testing.TINY.checkpoint_every
   print(f"{kills} kills, {saving} while saving; environment steps lost: {lost}")
 
-  process = testing.start(run, *FOR_EVER, said=said)
+  process = testing.start(run, *FOR_EVER, log=said)
   _wait(process, said)
   process.terminate()
   assert process.wait(PATIENCE_S) == 128 + signal.SIGTERM
@@ -110,8 +110,8 @@ def test_a_run_killed_at_random_times_ends_like_an_undisturbed_one(tmp_path, kil
   other += ["--replay.demonstrations", str(same)]
   straight, log = tmp_path / "straight", tmp_path / "log"
   together = [
-    testing.start(run, "--total-steps", total, said=said),
-    testing.start(straight, *other, said=log, log_compiles=True),
+    testing.start(run, "--total-steps", total, log=said),
+    testing.start(straight, *other, log=log, log_compiles=True),
   ]
   for process in together:
     _finish(process, said)

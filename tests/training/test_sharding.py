@@ -145,12 +145,10 @@ def test_two_processes_learn_what_one_learns_and_stop_together(tmp_path):
       address = f"127.0.0.1:{free.getsockname()[1]}"
     shared = ("--coordinator", address, "--processes", "2", "--process")
     common = ("--keep-checkpoints", "1000", *args)
-    return [
-      testing.start(run, *common, *shared, str(i), said=logs[i]) for i in range(2)
-    ]
+    return [testing.start(run, *common, *shared, str(i), log=logs[i]) for i in range(2)]
 
   pair = start("--total-steps", "32")
-  alone = testing.start(single, "--total-steps", "64", said=logs[2])
+  alone = testing.start(single, "--total-steps", "64", log=logs[2])
   for process, log in zip([*pair, alone], logs, strict=True):
     assert process.wait(PATIENCE_S) == 0, log.read_text()[-4000:]
   # Only the first process prints.
