@@ -87,6 +87,7 @@ def make_agent(config: AgentConfig) -> Agent:
   optimizer = make_optimizer(config, groups)
   loss = functools.partial(total_loss, networks, algorithm, evaluation)
 
+  @jax.jit  # Operation by operation, it would take longer.
   def init(key: PRNGKeyArray, observation: Observation) -> LearnerState:
     params, nu = networks.init(key, observation), jnp.zeros(())
     target_params = jax.tree.map(jnp.copy, params)

@@ -171,7 +171,7 @@ def test_losses_fall_on_a_fixed_batch(agent, state):
 def test_both_cameras_are_trained_by_the_value(agent, camera: str):
   batch = random_batch(6, batch=2, pixels=True)
   networks = agent.networks
-  params = networks.init(jax.random.key(0), batch.observation_tm1)
+  params = jax.jit(networks.init)(jax.random.key(0), batch.observation_tm1)
 
   def values(params):
     heads = networks.at(params, batch.observation_tm1)

@@ -42,7 +42,7 @@ def heads() -> KnownValues:
   head = evaluation.head(CONFIG.hidden)
   networks = make_networks(CONFIG, GROUPS, head, evaluation.value)
   seen = random_batch(0, STATES).observation_tm1
-  params = networks.init(jax.random.key(0), seen)
+  params = jax.jit(networks.init)(jax.random.key(0), seen)
   params["policy"]["out"]["bias"] = 0.2 * jnp.sin(jnp.arange(29.0))
   bound = networks.at(params, seen)
   return KnownValues(bound.networks, bound.params, bound.phi)

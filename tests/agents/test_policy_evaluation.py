@@ -58,7 +58,9 @@ def agent_with(algorithm: str, evaluation: str):
     CONFIG, algorithm=algorithm, policy_evaluation=evaluation
   )
   agent = make_agent(config)
-  params = agent.networks.init(jax.random.key(0), random_batch(0).observation_tm1)
+  params = jax.jit(agent.networks.init)(
+    jax.random.key(0), random_batch(0).observation_tm1
+  )
   params["z"] = jax.tree.map(lambda x: 3.0 * x, params["z"])
   params["z"]["out"]["kernel"] = random_array(9, 8, 1)
   return agent, algorithm_of(config), params
@@ -135,7 +137,9 @@ def test_double_q_takes_the_smaller_and_trains_both():
   slope = jax.grad(lambda x: evaluation.loss(x, target).sum())(outputs)
   np.testing.assert_allclose(slope, outputs - target[:, None], rtol=1e-6)
   agent = make_agent(config)
-  params = agent.networks.init(jax.random.key(0), random_batch(0).observation_tm1)
+  params = jax.jit(agent.networks.init)(
+    jax.random.key(0), random_batch(0).observation_tm1
+  )
   heads = agent.networks.at(params, random_batch(0).observation_tm1)
   first, second = jnp.moveaxis(heads.z(random_array(2, 3, 16, 7)), -1, 0)
   assert first.shape == (3, 16) and np.any(first != second)

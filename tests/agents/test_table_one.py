@@ -91,7 +91,7 @@ def example_of(name: str) -> Example:
   rng = np.random.default_rng(0)
   params = jax.tree.map(
     lambda x: x + 0.3 * jnp.asarray(rng.normal(size=x.shape), jnp.float32),
-    agent.networks.init(jax.random.key(0), batch.observation_tm1),
+    jax.jit(agent.networks.init)(jax.random.key(0), batch.observation_tm1),
   )
   trained = {**params, "nu": jnp.float32(NU)}
   # A target network that has fallen behind, as it has in training.
