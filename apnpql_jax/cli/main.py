@@ -17,7 +17,7 @@ from apnpql_jax.cli.commands import Json
 from apnpql_jax.cli.options import Train, parse
 from apnpql_jax.config import files
 from apnpql_jax.errors import ConfigError, UserError, check_name
-from apnpql_jax.runs.console import say
+from apnpql_jax.runs.console import print_line
 from apnpql_jax.runs.signals import Signals
 
 
@@ -47,10 +47,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         write(json.dumps(_plain(result)) if parsed.json else _show(result))
     return 0
   except UserError as error:
-    say(f"apnpql: {' '.join(str(error).split())}")
+    print_line(f"apnpql: {' '.join(str(error).split())}")
     return 2
   except errors.RunStopped as stop:
-    say(f"apnpql: {stop}")
+    print_line(f"apnpql: {stop}")
     if stop.code == errors.FAILED:
       # Threads of a failed save may wait for each other for minutes.
       os._exit(stop.code)
