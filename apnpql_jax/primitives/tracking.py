@@ -17,8 +17,7 @@ from apnpql_jax.types import Array
 
 GAIN = 2.0  # 1/s, close to the target
 # rad/s^2, far from the target: v = sqrt(2 a d) stops within d. Below the limit of 1.2
-# because a command is held for 0.15 s. Without this profile a gain of 2.0 overshoots
-# by 0.06 rad from full speed; the largest gain that does not is 1.7.
+# because a command is held for 0.15 s. GAIN alone would overshoot by 0.06 rad.
 BRAKING = 0.7
 DAMPING = 1e-3  # m or rad; far below the Jacobian's singular values in the workspace
 REFINE_STEPS = 4  # per control period; two reduce a jump of 10 cm to below 1 mm

@@ -18,7 +18,7 @@ from apnpql_jax.runs import checkpoint_record, leaves
 from apnpql_jax.runs.checkpoint_record import best, newest_until
 
 _CHUNK_BYTES = 16 << 20
-"""Unit of compression; a replay in one chunk kept a core busy twice as long."""
+"""Unit of compression; a replay in one chunk keeps a core busy twice as long."""
 
 
 class SaveError(OSError):
@@ -65,12 +65,12 @@ class CheckpointWriter:
     for a second state.
 
     Args:
-      step: environment steps done.
-      items: name -> pytree of arrays, including typed PRNG keys.
-      success_rate: decides which checkpoint is the best; None if not evaluated.
+      step: Environment steps done.
+      items: Name -> pytree of arrays, including typed PRNG keys.
+      success_rate: Decides which checkpoint is the best; None if not evaluated.
 
     Raises:
-      SaveError: this save cannot be started, or the previous one failed.
+      SaveError: This save cannot be started, or the previous one failed.
     """
     import jax
     import orbax.checkpoint as ocp
@@ -98,7 +98,7 @@ class CheckpointWriter:
     With ``wait``, waits for a save in progress.
 
     Raises:
-      SaveError: the save failed.
+      SaveError: The save failed.
     """
     if self._saving is None or not wait and self._manager.is_saving_in_progress():
       return {}
@@ -113,7 +113,7 @@ class CheckpointWriter:
     """Waits until everything saved is on disk.
 
     Raises:
-      SaveError: a save failed.
+      SaveError: A save failed.
     """
     try:
       self._manager.wait_until_finished()
@@ -152,8 +152,8 @@ class CheckpointWriter:
 class _KeepNewestAndBest:
   """Orbax policy that keeps the newest checkpoints, their items, and the best one.
 
-  Orbax's own policies do not see items, and its BestN reads the rate from an item that
-  existing checkpoints lack.
+  Orbax's own policies do not see items, and its BestN reads the rate from an item of
+  its own instead of the record.
   """
 
   def __init__(self, run_dir: Path, keep: int):
