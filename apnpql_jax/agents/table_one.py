@@ -88,7 +88,8 @@ def algorithm_of(config: AgentConfig) -> Algorithm:
   """Returns the row that ``config`` names, with the columns that it replaces.
 
   Raises:
-    ConfigError: for an unknown row, or Retrace with a policy that has no density.
+    ConfigError: The row is unknown, or Retrace is combined with a policy that has no
+      density.
   """
   check_name("agent.algorithm", config.algorithm, tuple(ALGORITHMS))
   row = ALGORITHMS[config.algorithm]

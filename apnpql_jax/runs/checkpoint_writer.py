@@ -26,7 +26,7 @@ class SaveError(OSError):
 
 
 class CheckpointWriter:
-  """Saves the checkpoints of one run and deletes those that are no longer needed.
+  """Writer of the checkpoints of one run, which deletes those no longer needed.
 
   Use as a context manager: leaving it waits until the last save is on disk, unless a
   save has failed. A checkpoint becomes visible only once it is complete.
@@ -163,6 +163,7 @@ class _KeepNewestAndBest:
     self.items = {step: set(record.items) for step, record in records.items()}
 
   def should_preserve(self, checkpoints: Sequence[Any], **_: Any) -> list[bool]:
+    """Returns for each checkpoint whether to keep it; called by Orbax."""
     steps = sorted(info.step for info in checkpoints)
     newest = steps[-self._keep :]
     kept = {*newest, best({step: self.rates.get(step) for step in steps})}

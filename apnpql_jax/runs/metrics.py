@@ -52,7 +52,7 @@ class Sink(Protocol):
 
 
 class MetricWriter:
-  """Appends rows to ``metrics.jsonl``; each is on disk when ``write`` returns.
+  """Writer of ``metrics.jsonl``; each row is on disk when ``write`` returns.
 
   A file that has grown too large is renamed to ``metrics.<n>.jsonl``, starting at 1.
   """

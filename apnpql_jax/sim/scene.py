@@ -71,8 +71,8 @@ def load_scene(
   the parsed file, such as the shape of an object, but keep its structure.
 
   Raises:
-    ConfigError: the file does not compile, lacks a joint, site or camera, or
-      uses a feature that MJX would silently ignore.
+    ConfigError: The file does not compile, lacks a joint, site or camera, or uses a
+      feature that MJX would silently ignore.
   """
   models = [_compile(path, edit) for edit in variants or [lambda _: None]]
   model = models[0]

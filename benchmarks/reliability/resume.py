@@ -56,7 +56,7 @@ def compare(a: Arrays, b: Arrays) -> dict[str, Any]:
   """Counts the arrays of equal bits and measures the largest relative difference.
 
   Raises:
-    ValueError: the states have different arrays.
+    ValueError: The states have different arrays.
   """
   if a.keys() != b.keys():
     raise ValueError(f"only one state has {sorted(a.keys() ^ b.keys())}")
