@@ -26,7 +26,7 @@ CONFIG = AgentConfig(
 
 
 def all_networks(config: AgentConfig = CONFIG) -> Networks:
-  """Networks with every group, and categorical values."""
+  """Returns networks with every group, and categorical values."""
   evaluation = Categorical(config)
   head = evaluation.head(config.hidden)
   return make_networks(config, GROUPS, head, evaluation.value)
@@ -197,7 +197,7 @@ def test_points_are_seen_from_the_tool_in_detail_where_they_are_near():
   np.testing.assert_allclose(seen, expected, atol=1e-5)
 
 
-def test_features_tell_a_centimeter_near_the_tool():
+def test_features_resolve_a_centimeter_near_the_tool():
   networks = all_networks()
   seen = observation(1, pixels=False, objects=True)
   params = jax.jit(networks.init)(jax.random.key(0), seen)
@@ -316,7 +316,7 @@ def test_a_learned_mean_is_trained_and_kept_in_the_box():
   assert np.all(mean(bias - 9.0) == -1.0)
 
 
-def test_diagonal_covariances_have_nothing_beside_the_diagonal():
+def test_diagonal_covariances_are_zero_off_the_diagonal():
   heads = fresh_heads(dataclasses.replace(CONFIG, diagonal_covariance=True))
   for mixture in (heads.prior(), heads.policy()):
     scale = np.asarray(mixture.scale_tril)

@@ -172,7 +172,7 @@ def test_reverse_kl_of_a_gaussian_and_a_uniform_prior_is_exact(heads):
   assert np.mean(step.kl - expected) == pytest.approx(0.0, abs=0.1)
 
 
-def test_reverse_kl_tells_the_weights_of_q_on_draws_of_pi(heads):
+def test_reverse_kl_weighs_draws_of_pi_as_q_does(heads):
   prior, policy, alpha = heads.prior(), heads.policy(), np.asarray(heads.alpha())
   step = policy_update.reverse_kl(heads, prior, jax.random.key(5))
   pi = step.candidates
@@ -189,7 +189,7 @@ def test_reverse_kl_tells_the_weights_of_q_on_draws_of_pi(heads):
   "project", [policy_update.forward_kl, policy_update.reverse_kl]
 )
 def test_a_projection_brings_the_policy_to_the_better_actions(heads, project):
-  """Descent on psi alone moves mean and gripper towards what Q likes."""
+  """Descent on psi alone moves mean and gripper toward what Q likes."""
   prior = UniformBox((STATES,), 6)
 
   def loss(psi, key):

@@ -228,7 +228,7 @@ def test_actions_are_those_of_the_policy_that_the_row_names(name: str):
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_values_are_learnt_as_the_row_names(name: str):
+def test_values_are_learned_as_the_row_defines(name: str):
   """Outputs of the value head, and whether one reward or a window is read."""
   example, columns = example_of(name), COLUMNS[name]
   batch, window = example.batch, example.batch.window

@@ -314,7 +314,7 @@ DEEPER = st.sampled_from([True, True, True, False])
 
 @pytest.fixture(scope="module")
 def foreign(tmp_path_factory) -> Path:
-  """A run to whose record somebody else has the pen."""
+  """Returns a run whose record the tests rewrite."""
   run = tmp_path_factory.mktemp("foreign")
   _save(run, (1, _state(1), 0.5))
   return run
@@ -322,8 +322,8 @@ def foreign(tmp_path_factory) -> Path:
 
 @settings(max_examples=100, deadline=None)
 @given(st.data())
-def test_a_record_that_somebody_wrote_is_refused_in_one_line_or_right(foreign, data):
-  """One value of it in place of another, with a checksum that fits."""
+def test_forged_records_are_rejected_or_equivalent(foreign, data):
+  """Replaces one value of a record, and its checksum to match."""
   path = foreign / "checkpoints" / "1" / "meta" / "metadata"
   whole = path.read_text()
   record = json.loads(whole)

@@ -83,7 +83,7 @@ def test_rows_are_on_disk_at_once(tmp_path: Path):
   assert _jsonl(tmp_path) == [row]
 
 
-def test_values_that_are_not_finite_become_null(tmp_path: Path):
+def test_non_finite_values_become_null(tmp_path: Path):
   with metrics.MetricWriter(tmp_path) as writer:
     writer.write(4, {"b": float("nan"), "c": float("inf")})
   # Strict JSON: no NaN token, which most readers reject.

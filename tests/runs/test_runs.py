@@ -38,7 +38,7 @@ def test_configuration_of_a_run_is_read_back(tmp_path):
   assert run_folder.load_run_config(write_run(tmp_path / "a", config)) == config
 
 
-def test_a_run_made_before_a_setting_came_is_read_and_that_is_said(tmp_path):
+def test_a_run_older_than_a_setting_is_read_with_a_warning(tmp_path):
   config = TrainConfig(seed=3, agent=AgentConfig(gamma=0.9))
   run = write_run(tmp_path / "a", config)
   data = json.loads((run / "config.json").read_text())
@@ -82,7 +82,7 @@ def test_resume_may_change_only_what_does_not_alter_learning(tmp_path):
       run_folder.check_resumable(run, dataclasses.replace(TrainConfig(), **changed))
 
 
-def test_a_run_that_is_trained_is_left_alone(tmp_path):
+def test_a_run_in_training_is_not_replaced(tmp_path):
   run, other = write_run(tmp_path / "run"), write_run(tmp_path / "other")
   with run_folder.lock(run), run_folder.lock(other):
     for refused in (

@@ -92,7 +92,7 @@ main.main(["list"])
 """
 
 
-def test_the_exit_code_tells_even_where_no_line_can_be_written():
+def test_the_exit_code_is_right_even_if_no_line_can_be_written():
   with open("/dev/full", "w") as full:  # As standard error on the disk that is full.
     root = Path(__file__).parents[2]
     command = [sys.executable, "-c", STOPPED]

@@ -244,7 +244,7 @@ def test_a_broken_world_restarts_and_its_episode_is_never_drawn(
     drawn = jax.tree.leaves((batch.observation_tm1, batch.observation_t))
     assert all(jnp.isfinite(x).all() for x in drawn)
     robot = np.asarray(after.replay.slots.timestep.observation.robot)[newest, 1]
-    # With an LSTM a start is a window of time steps.
+    # With an LSTM a start is a window of instants.
     starts = np.asarray(batch.observation_tm1.robot)[batch.weight > 0]
     starts = starts.reshape(-1, robot.shape[-1])
     assert not (starts[:, None, :] == robot[None]).all(-1).any()

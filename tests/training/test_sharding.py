@@ -45,7 +45,7 @@ from benchmarks.speed import messages
 DEVICES = 4
 ITERATIONS = 3
 LENGTH = 26
-"""Time steps of the replay; no other size in the program has this value."""
+"""Instants of the replay; no other size in the program has this value."""
 
 ROUNDING = 1e-4
 """Allowed distance as a fraction of how far the parameters moved; measured: 1e-6."""
