@@ -102,13 +102,13 @@ def test_the_replay_is_what_the_worlds_showed(demos, env):
 
 def test_the_file_has_the_requested_name(tmp_path, demos, env):
   for name in ("demos", "demos.v1", "demos.npz"):
-    told = demonstrations.save(
+    summary = demonstrations.save(
       tmp_path / name, demos, task="push_plate", control_period_s=0.15
     )
-    assert told["file"] == str(tmp_path / name)
+    assert summary["file"] == str(tmp_path / name)
     assert (
       demonstrations.load(
-        Path(told["file"]), env.task, env.config.control_period_s
+        Path(summary["file"]), env.task, env.config.control_period_s
       ).instants
       == demos.instants
     )

@@ -403,7 +403,7 @@ with t.CheckpointWriter(run, t.CONFIG, keep=2) as writer:
 )
 def test_a_process_killed_while_it_saves_loses_one_save_at_most(tmp_path, moments):
   """Killed at random moments of a loop that does nothing but save."""
-  rng, said = np.random.default_rng(moments), 0
+  rng, printed = np.random.default_rng(moments), 0
   here = Path(__file__).parent
   command = [sys.executable, "-c", SAVE_FOR_EVER, str(tmp_path), str(here)]
   for _ in range(moments):
@@ -411,12 +411,14 @@ def test_a_process_killed_while_it_saves_loses_one_save_at_most(tmp_path, moment
       command, cwd=here.parents[1], stdout=subprocess.PIPE, text=True
     ) as process:
       assert process.stdout is not None
-      said = int(process.stdout.readline())
+      printed = int(process.stdout.readline())
       time.sleep(rng.uniform(0.0, 0.6))
       process.kill()
-      said = max([said, *(int(line) for line in process.stdout if line.endswith("\n"))])
+      printed = max(
+        [printed, *(int(line) for line in process.stdout if line.endswith("\n"))]
+      )
     step = checkpoint_reader.latest_step(tmp_path)
-    assert step is not None and step in (said, said + 1)
+    assert step is not None and step in (printed, printed + 1)
     found = checkpoint_reader.restore(
       tmp_path, None, {"state": _state(0, images=200_000)}
     )

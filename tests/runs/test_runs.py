@@ -44,9 +44,9 @@ def test_a_run_older_than_a_setting_is_read_with_a_warning(tmp_path):
   data = json.loads((run / "config.json").read_text())
   del data["agent"]["residual_blocks"]
   (run / "config.json").write_text(json.dumps(data))
-  said: list[str] = []
-  assert run_folder.load_run_config(run, said.append) == config
-  assert said == [
+  warnings: list[str] = []
+  assert run_folder.load_run_config(run, warnings.append) == config
+  assert warnings == [
     f"{run}/config.json is older than some settings, which keep their old behavior: "
     "agent.residual_blocks 0"
   ]
