@@ -11,7 +11,7 @@ from apnpql_jax.agents.columns.candidates import (
   all_on_the_highest,
   evaluate,
 )
-from apnpql_jax.agents.heads import Heads
+from apnpql_jax.agents.networks import Heads
 from apnpql_jax.agents.table_one import Algorithm
 from apnpql_jax.config.checks import ACTING
 from apnpql_jax.dists import boltzmann

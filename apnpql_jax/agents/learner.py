@@ -17,9 +17,8 @@ from apnpql_jax.agents import losses
 from apnpql_jax.agents.acting import choose_action
 from apnpql_jax.agents.augmentation import augment
 from apnpql_jax.agents.columns.candidates import Candidates
-from apnpql_jax.agents.columns.policy_evaluation import Evaluation
-from apnpql_jax.agents.heads import Heads, Networks, Params
-from apnpql_jax.agents.networks import make_networks
+from apnpql_jax.agents.columns.policy_evaluation import PolicyEvaluation
+from apnpql_jax.agents.networks import Heads, Networks, Params, make_networks
 from apnpql_jax.agents.table_one import Algorithm, algorithm_of, epsilon_bounds
 from apnpql_jax.config.checks import validate
 from apnpql_jax.config.schema import AgentConfig, TrainConfig
@@ -30,11 +29,20 @@ from apnpql_jax.types import Array, Metrics, Observation, Transition
 class LearnerState(struct.PyTreeNode):
   """Complete state of the learner."""
 
-  params: Params  # one entry per group that the algorithm has
-  target_params: Params  # moving average of params; these act
-  nu: Float[Array, ""]  # multiplier >= 0 of the entropy floor
-  opt_state: Any  # of one Adam per learning rate
-  step: Int[Array, ""]  # updates done
+  params: Params
+  """Parameters, one entry per group that the algorithm has."""
+
+  target_params: Params
+  """Moving average of ``params``; these act."""
+
+  nu: Float[Array, ""]
+  """Multiplier >= 0 of the entropy floor."""
+
+  opt_state: Any
+  """State of one Adam per learning rate."""
+
+  step: Int[Array, ""]
+  """Number of updates done."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,30 +50,41 @@ class Agent:
   """Pure functions of one configuration; all can be jitted, scanned and sharded."""
 
   networks: Networks
-  evaluation: Evaluation
-  # (key, example observation with a batch axis) -> state before learning.
+  """The networks, without parameters."""
+
+  policy_evaluation: PolicyEvaluation
+  """How the algorithm represents and learns values."""
+
   init: Callable[[PRNGKeyArray, Observation], LearnerState]
-  # (params, observation [B], key, *, acting="policy") -> actions f32[B, 7], info f32[B]
-  # each: the action's log_prob, which Retrace needs, and for diagnosis its q, the
-  # candidates' q_max and ess, and alpha. ``acting.choose_action`` lists the rules.
+  """(key, example observation with a batch axis) -> state before learning."""
+
   act: Callable[..., tuple[Array, Metrics]]
-  # (state, transitions [B], key) -> state after one update, metrics f32[].
+  """(params, observation [B], key, *, acting="policy") -> actions f32[B, 7], info.
+
+  ``acting`` names a rule, see ``acting.choose_action``. ``info`` holds f32[B] each: the
+  action's ``log_prob``, which Retrace needs, and for diagnosis its ``q``, the
+  candidates' ``q_max`` and ``ess``, and ``alpha``.
+  """
+
   update: Callable[
     [LearnerState, Transition, PRNGKeyArray], tuple[LearnerState, Metrics]
   ]
+  """(state, transitions [B], key) -> state after one update, metrics f32[]."""
 
 
 def make_agent(config: AgentConfig) -> Agent:
   """Builds the agent that ``config`` describes.
 
   Raises:
-    ConfigError: for an unknown algorithm or settings that cannot work.
+    ConfigError: The algorithm is unknown, or the settings cannot work.
   """
   validate(TrainConfig(agent=config), algorithms=epsilon_bounds())
   algorithm = algorithm_of(config)
   groups = algorithm.groups(config)
   evaluation = algorithm.policy_evaluation(config)
-  networks = make_networks(config, groups, evaluation)
+  networks = make_networks(
+    config, groups, evaluation.head(config.hidden), evaluation.value
+  )
   optimizer = make_optimizer(config, groups)
   loss = functools.partial(total_loss, networks, algorithm, evaluation)
 
@@ -112,7 +131,7 @@ def make_agent(config: AgentConfig) -> Agent:
     nu = jnp.maximum(params.pop("nu"), 0.0)
     metrics |= {f"grad_norm/{k}": optax.tree.norm(grads[k]) for k in groups}
     metrics["prior/nu"] = nu
-    # Move the target network towards the new parameters.
+    # Move the target network toward the new parameters.
     rate = config.target_rate
     target_params = jax.tree.map(
       lambda new, old: old + rate * (new - old), params, state.target_params
@@ -149,7 +168,7 @@ def make_optimizer(
 def bellman_target(
   networks: Networks,
   algorithm: Algorithm,
-  evaluation: Evaluation,
+  evaluation: PolicyEvaluation,
   target_params: Params,
   batch: Transition,
   key: PRNGKeyArray,
@@ -168,7 +187,7 @@ def bellman_target(
 def total_loss(
   networks: Networks,
   algorithm: Algorithm,
-  evaluation: Evaluation,
+  evaluation: PolicyEvaluation,
   trained: Params,
   target_params: Params,
   batch: Transition,

@@ -17,7 +17,7 @@ from apnpql_jax.config.checks import ACTING, BACKENDS, validate
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs import run_folder
-from apnpql_jax.runs.console import say
+from apnpql_jax.runs.console import print_line
 
 if TYPE_CHECKING:
   from jax.sharding import Mesh
@@ -34,7 +34,7 @@ def base_config(args: Train) -> TrainConfig:
   if args.resume is None:
     names = ", ".join(files.preset_names())
     raise ConfigError(f"train needs a preset; choose from {names}")
-  return run_folder.load_run_config(args.resume, say)
+  return run_folder.load_run_config(args.resume, print_line)
 
 
 def train(args: Train) -> Json:
@@ -76,7 +76,7 @@ def evaluate(args: Evaluate) -> Json:
     check_name("backend", args.backend, BACKENDS)
   if args.acting is not None:
     check_name("acting", args.acting, ACTING)
-  run_folder.load_run_config(Path(args.run), say)
+  run_folder.load_run_config(Path(args.run), print_line)
 
   from apnpql_jax.training.evaluate import evaluate as evaluate_run
 
@@ -132,11 +132,11 @@ def repeat(args: Repeat) -> Json:
   if not args.file:
     raise ConfigError("repeat needs a file: apnpql repeat RUN/faults/step_<n>.npz")
   path = Path(args.file).absolute()
-  run_folder.load_run_config(path.parent.parent, say)
+  run_folder.load_run_config(path.parent.parent, print_line)
 
-  from apnpql_jax.training import faults
+  from apnpql_jax.training import skipped_updates
 
-  return faults.repeat(path)
+  return skipped_updates.repeat(path)
 
 
 def list_names(args: List) -> Json:

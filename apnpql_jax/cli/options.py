@@ -126,7 +126,8 @@ class Collect(_Play):
   """Standard deviation of the noise on the expert's joint velocities (rad/s)."""
 
   save: _File = None
-  """Also save as many episodes from training resets as a file of demonstrations."""
+  """Also record as many episodes, started from training resets, to this demonstrations
+  file."""
 
 
 @dataclasses.dataclass(frozen=True)

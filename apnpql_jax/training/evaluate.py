@@ -17,7 +17,7 @@ from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.runs import checkpoint_reader, leaves, run_folder
-from apnpql_jax.runs.console import say
+from apnpql_jax.runs.console import print_line
 from apnpql_jax.runs.metrics import wilson_interval
 from apnpql_jax.training.rollout import (
   Episodes,
@@ -112,7 +112,7 @@ def evaluate(
   devices.check_memory(leaves.nbytes(example), "the learner")
   found = checkpoint_reader.restore(run_dir, step, {"learner": example}, config=config)
   for line in found.damaged:
-    say(line)
+    print_line(line)
   learner = found.items["learner"]
   acting = acting or config.eval_acting
   play = make_player(env, lambda params: agent_policy(agent, params, acting=acting))
@@ -152,6 +152,6 @@ def _summary(
     try:
       summary["video"] = str(record_episodes(env, played, video))
     except OSError as error:  # The episodes took minutes; keep their figures.
-      say(f"cannot write {video}: {error}")
+      print_line(f"cannot write {video}: {error}")
       summary["video"] = None
   return summary | {"checkpoint_step": step, "wall_s": time.monotonic() - began}

@@ -24,7 +24,7 @@ EVAL_SEED = 1
 
 
 class Reporter:
-  """Writes and displays a run; only the first process has one."""
+  """Writer and display of a run; only the first process has one."""
 
   def __init__(
     self,

@@ -12,8 +12,8 @@ import pytest
 
 from apnpql_jax.agents.acting import choose_action
 from apnpql_jax.agents.columns.policy import parametric
-from apnpql_jax.agents.heads import Heads
 from apnpql_jax.agents.learner import make_agent
+from apnpql_jax.agents.networks import Heads
 from apnpql_jax.agents.table_one import ALGORITHMS, algorithm_of
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.testing import SMALL, random_batch

@@ -60,9 +60,7 @@ def _cases() -> list[Any]:
 
 
 @pytest.mark.parametrize(("name", "pixels", "updates"), _cases())
-def test_no_batch_produces_a_number_that_is_not_finite(
-  name: str, pixels: bool, updates: int
-):
+def test_no_batch_produces_a_non_finite_number(name: str, pixels: bool, updates: int):
   """Combines rewards and states up to 1e6 with images unlike any rendered one."""
   config = dataclasses.replace(SMALL, algorithm=name)
   agent = make_agent(config)

@@ -16,8 +16,7 @@ from scipy import special
 from apnpql_jax.agents.columns import policy_update
 from apnpql_jax.agents.columns.policy import cem, non_parametric, parametric
 from apnpql_jax.agents.columns.policy_evaluation import TD0
-from apnpql_jax.agents.heads import GROUPS, Heads
-from apnpql_jax.agents.networks import make_networks
+from apnpql_jax.agents.networks import GROUPS, Heads, make_networks
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.dists.action import UniformBox
 from apnpql_jax.testing import random_batch
@@ -39,7 +38,9 @@ class KnownValues(Heads):
 
 @pytest.fixture(scope="module")
 def heads() -> KnownValues:
-  networks = make_networks(CONFIG, GROUPS, TD0(CONFIG))
+  evaluation = TD0(CONFIG)
+  head = evaluation.head(CONFIG.hidden)
+  networks = make_networks(CONFIG, GROUPS, head, evaluation.value)
   seen = random_batch(0, STATES).observation_tm1
   params = jax.jit(networks.init)(jax.random.key(0), seen)
   params["policy"]["out"]["bias"] = 0.2 * jnp.sin(jnp.arange(29.0))
@@ -159,7 +160,7 @@ def test_reverse_kl_of_a_gaussian_and_a_uniform_prior_is_exact(heads):
   assert np.mean(step.kl - expected) == pytest.approx(0.0, abs=0.1)
 
 
-def test_reverse_kl_tells_the_weights_of_q_on_draws_of_pi(heads):
+def test_reverse_kl_weighs_draws_of_pi_as_q_does(heads):
   prior, policy, alpha = heads.prior(), heads.policy(), np.asarray(heads.alpha())
   step = policy_update.reverse_kl(heads, prior, jax.random.key(5))
   pi = step.candidates
@@ -176,7 +177,7 @@ def test_reverse_kl_tells_the_weights_of_q_on_draws_of_pi(heads):
   "project", [policy_update.forward_kl, policy_update.reverse_kl]
 )
 def test_a_projection_brings_the_policy_to_the_better_actions(heads, project):
-  """Descent on psi alone moves mean and gripper towards what Q likes."""
+  """Descent on psi alone moves mean and gripper toward what Q likes."""
   prior = UniformBox((STATES,), 6)
 
   def loss(psi, key):

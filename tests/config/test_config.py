@@ -192,7 +192,7 @@ def test_replay_larger_than_memory_is_rejected():
 
 
 def test_a_replay_must_hold_the_window_of_an_lstm():
-  config = changed("replay.capacity", 256)  # Eight time steps per world.
+  config = changed("replay.capacity", 256)  # Eight instants per world.
   validate(replaced(config, ["agent", "lstm_instants"], 4))
   with pytest.raises(ConfigError, match="replay.capacity=256 .* at least 288"):
     validate(replaced(config, ["agent", "lstm_instants"], 5))

@@ -17,10 +17,10 @@ from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.sim import arm
 from apnpql_jax.training import evaluate
 from apnpql_jax.training.evaluate import play_held_out
-from apnpql_jax.training.expert import example_slot
 from apnpql_jax.training.rollout import (
   FILMED,
   agent_policy,
+  example_slot,
   expert_policy,
   make_player,
   rollout,

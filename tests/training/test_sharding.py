@@ -45,7 +45,7 @@ from benchmarks.speed import messages
 DEVICES = 4
 ITERATIONS = 3
 LENGTH = 26
-"""Time steps of the replay; no other size in the program has this value."""
+"""Instants of the replay; no other size in the program has this value."""
 
 ROUNDING = 1e-4
 """Allowed distance as a fraction of how far the parameters moved; measured: 1e-6."""
@@ -146,11 +146,9 @@ def test_two_processes_learn_what_one_learns_and_stop_together(tmp_path, resumed
       address = f"127.0.0.1:{free.getsockname()[1]}"
     shared = ("--coordinator", address, "--processes", "2", "--process")
     common = ("--keep-checkpoints", "1000", *args)
-    return [
-      testing.start(run, *common, *shared, str(i), said=logs[i]) for i in range(2)
-    ]
+    return [testing.start(run, *common, *shared, str(i), log=logs[i]) for i in range(2)]
 
-  alone = testing.start(single, "--total-steps", "64", said=logs[2])
+  alone = testing.start(single, "--total-steps", "64", log=logs[2])
   if resumed:
     for process, log in zip(start("--total-steps", "32"), logs, strict=False):
       assert process.wait(PATIENCE_S) == 0, log.read_text()[-4000:]

@@ -7,10 +7,11 @@ import math
 from flax import struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from apnpql_jax.agents.heads import Heads
+from apnpql_jax.agents.networks import Heads
 from apnpql_jax.dists.action import ActionDistribution
+from apnpql_jax.types import Array
 
 
 class Candidates(struct.PyTreeNode):

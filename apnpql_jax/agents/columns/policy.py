@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
 
 from apnpql_jax.agents.columns.candidates import (
   Candidates,
@@ -15,7 +16,7 @@ from apnpql_jax.agents.columns.candidates import (
   clip_action,
   evaluate,
 )
-from apnpql_jax.agents.heads import Heads
+from apnpql_jax.agents.networks import Heads
 from apnpql_jax.dists import boltzmann
 from apnpql_jax.dists.action import ActionDistribution
 from apnpql_jax.dists.gmm import GripperGMM
@@ -29,7 +30,7 @@ CEM_MIN_STD = 0.01  # rad/s; floor of the elites' deviation, to keep draws apart
 def non_parametric(
   heads: Heads,
   prior: ActionDistribution,
-  key: Array,
+  key: PRNGKeyArray,
   *,
   num_samples: int,
 ) -> Candidates:
@@ -48,7 +49,7 @@ def non_parametric(
 def parametric(
   heads: Heads,
   prior: ActionDistribution,
-  key: Array,
+  key: PRNGKeyArray,
   *,
   num_samples: int,
 ) -> Candidates:
@@ -73,7 +74,7 @@ def parametric(
 def cem(
   heads: Heads,
   prior: ActionDistribution,
-  key: Array,
+  key: PRNGKeyArray,
   *,
   num_samples: int,
 ) -> Candidates:
