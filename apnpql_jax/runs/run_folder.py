@@ -23,8 +23,8 @@ CONFIG_FILE = "config.json"
 _MAX_CONFIG_BYTES = 1 << 20
 
 MAY_CHANGE = (
-  "total_steps eval_every eval_episodes checkpoint_every keep_checkpoints "
-  "save_replay_every max_skipped_updates video sinks"
+  "total_steps eval_every eval_episodes eval_acting checkpoint_every "
+  "keep_checkpoints save_replay_every max_skipped_updates video sinks"
 ).split()
 """Settings that a resumed run may change, because they do not affect learning."""
 

@@ -219,7 +219,7 @@ def test_outputs_have_the_declared_shapes(pixels: bool, objects: bool):
   networks = all_networks()
 
   def look(seen: Observation) -> Any:
-    params = jax.jit(networks.init)(jax.random.key(0), seen)
+    params = networks.init(jax.random.key(0), seen)
     assert tuple(params) == GROUPS
     heads, actions = networks.at(params, seen), jnp.zeros((9, 4, 7))
     found = heads.phi, heads.primitives(), heads.alpha(), heads.z(actions)
