@@ -9,7 +9,7 @@ from jaxtyping import PRNGKeyArray
 from apnpql_jax.agents.columns.candidates import (
   Candidates,
   all_on_the_highest,
-  evaluate,
+  score,
 )
 from apnpql_jax.agents.networks import Heads
 from apnpql_jax.agents.table_one import Algorithm
@@ -38,7 +38,7 @@ def choose_action(
     Actions f32[B, 7] and their metrics, see ``Agent.act``.
 
   Raises:
-    ConfigError: for an unknown rule.
+    ConfigError: The rule is unknown.
   """
   check_name("acting", acting, ACTING)
   key_candidates, key_pick = jax.random.split(key)
@@ -65,7 +65,7 @@ def _candidates(
     samples = prior.sample(seed=key, sample_shape=1)
     ones = jnp.ones(samples.shape[:-1])
     return Candidates(
-      samples, *evaluate(heads, samples), ones, prior, jnp.zeros_like(ones[0])
+      samples, *score(heads, samples), ones, prior, jnp.zeros_like(ones[0])
     )
   drawn = algorithm.policy(heads, prior, key, num_samples=heads.config.policy_samples)
   if acting == "greedy":
@@ -88,6 +88,6 @@ def _means(heads: Heads, drawn: Candidates) -> Candidates:
   samples = jnp.concatenate(
     [jnp.concatenate([arm, open_hand + gripper], axis=-1) for gripper in (0.0, 1.0)]
   )
-  actions, outputs, q_values = evaluate(heads, samples)
+  actions, outputs, q_values = score(heads, samples)
   weights = all_on_the_highest(base.log_prob(samples) + drawn.tilt * q_values)
   return Candidates(samples, actions, outputs, q_values, weights, base, drawn.tilt)

@@ -125,18 +125,9 @@ def make_agent(config: AgentConfig) -> Agent:
     grads, metrics = jax.grad(loss, has_aux=True)(
       trained, state.target_params, batch, target, key_tm1
     )
-    # Step all optimizers, and keep nu nonnegative.
-    steps, opt_state = optimizer.update(grads, state.opt_state, trained)
-    params = jax.tree.map(jnp.add, trained, steps)
-    nu = jnp.maximum(params.pop("nu"), 0.0)
+    after = apply_gradients(optimizer, state, trained, grads, config.target_rate)
     metrics |= {f"grad_norm/{k}": optax.tree.norm(grads[k]) for k in groups}
-    metrics["prior/nu"] = nu
-    # Move the target network toward the new parameters.
-    rate = config.target_rate
-    target_params = jax.tree.map(
-      lambda new, old: old + rate * (new - old), params, state.target_params
-    )
-    return LearnerState(params, target_params, nu, opt_state, state.step + 1), metrics
+    return after, metrics | {"prior/nu": after.nu}
 
   return Agent(networks, evaluation, init, act, update)
 
@@ -163,6 +154,26 @@ def make_optimizer(
   step = {"encoder": "e_step", "ap": "e_step", "z": "e_step", "bp": "m_step"}
   labels = {group: step.get(group, group) for group in (*groups, "nu")}
   return optax.partition({k: adam(rates[k]) for k in labels.values()}, labels)
+
+
+def apply_gradients(
+  optimizer: optax.GradientTransformation,
+  state: LearnerState,
+  trained: Params,
+  grads: Params,
+  target_rate: float,
+) -> LearnerState:
+  """Steps all optimizers and moves the target network toward the new parameters.
+
+  ``trained`` and ``grads`` are the parameter groups and nu, which stays nonnegative.
+  """
+  steps, opt_state = optimizer.update(grads, state.opt_state, trained)
+  params = jax.tree.map(jnp.add, trained, steps)
+  nu = jnp.maximum(params.pop("nu"), 0.0)
+  target_params = jax.tree.map(
+    lambda new, old: old + target_rate * (new - old), params, state.target_params
+  )
+  return LearnerState(params, target_params, nu, opt_state, state.step + 1)
 
 
 def bellman_target(

@@ -134,9 +134,11 @@ def train(task: str, row: str, seed: int) -> None:
     subprocess.run([*apnpql, *command, "--run", str(run)], check=True)
     play = f"--episodes {EPISODES} --seed {EPISODES_SEED} --json".split()
     play = [*apnpql, "evaluate", str(run), *play]
+    # "greedy" of the stored results: the highest Q of q, or the mean of a Gaussian.
+    non_parametric = ROWS[row].algorithm == "ap_npql"
     final, greedy = (
-      json.loads(subprocess.check_output([*play, *flags]))
-      for flags in ([], ["--acting", "greedy"])
+      json.loads(subprocess.check_output([*play, "--acting", acting]))
+      for acting in ("policy", "greedy" if non_parametric else "mean")
     )
     result = {
       "command": command,

@@ -50,7 +50,7 @@ def clip_action(actions: Float[Array, "*b 7"]) -> Float[Array, "*b 7"]:
   return jnp.clip(actions, -1.0, 1.0)
 
 
-def evaluate(
+def score(
   heads: Heads, samples: Float[Array, " s *b 7"]
 ) -> tuple[Float[Array, " s *b 7"], Float[Array, " s *b n"], Float[Array, " s *b"]]:
   """Returns clipped actions, the outputs of the value head, and Q."""

@@ -14,7 +14,7 @@ from apnpql_jax.agents.columns.candidates import (
   Candidates,
   all_on_the_highest,
   clip_action,
-  evaluate,
+  score,
 )
 from apnpql_jax.agents.networks import Heads
 from apnpql_jax.dists import boltzmann
@@ -40,7 +40,7 @@ def non_parametric(
   """
   heads, prior = heads.frozen(), jax.lax.stop_gradient(prior)
   samples = prior.sample(seed=key, sample_shape=num_samples)
-  actions, outputs, q_values = evaluate(heads, samples)
+  actions, outputs, q_values = score(heads, samples)
   alpha = heads.alpha()
   weights = boltzmann.importance_weights(q_values, alpha)
   return Candidates(samples, actions, outputs, q_values, weights, prior, 1.0 / alpha)
@@ -64,7 +64,7 @@ def parametric(
   drawn = policy.sample(seed=key, sample_shape=num_samples // 2)
   both = jnp.stack([drawn.at[..., -1].set(gripper) for gripper in (0.0, 1.0)])
   samples = both.reshape(-1, *drawn.shape[1:])
-  actions, outputs, q_values = evaluate(heads.frozen(), samples)
+  actions, outputs, q_values = score(heads.frozen(), samples)
   log_prob = policy.log_prob(samples).reshape(both.shape[:-1])
   weights = jax.nn.softmax(log_prob, axis=0).reshape(q_values.shape) / drawn.shape[0]
   tilt = jnp.zeros(q_values.shape[1:])
@@ -87,9 +87,9 @@ def cem(
   *keys, last = jax.random.split(key, CEM_ITERATIONS)
   for k in keys:
     samples = base.sample(seed=k, sample_shape=CEM_SAMPLES)
-    base = _refit(samples, evaluate(heads, samples)[2], heads.config.policy_min_prob)
+    base = _refit(samples, score(heads, samples)[2], heads.config.policy_min_prob)
   samples = base.sample(seed=last, sample_shape=CEM_SAMPLES)
-  actions, outputs, q_values = evaluate(heads, samples)
+  actions, outputs, q_values = score(heads, samples)
   weights = all_on_the_highest(q_values)
   tilt = jnp.zeros(q_values.shape[1:])
   return Candidates(samples, actions, outputs, q_values, weights, base, tilt)
