@@ -39,7 +39,7 @@ cuda: $(VENV)/.runtime
 
 clean:
 	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis build dist
-	find apnpql_jax experiments tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	find apnpql_jax benchmarks docs experiments tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Training needs only the first lock; what the tests add comes with the first test.
 $(VENV)/.runtime: requirements.lock pyproject.toml | $(VENV)/.python

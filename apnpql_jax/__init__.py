@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from apnpql_jax.version import __version__
+__version__ = "0.2.0"
 
 if TYPE_CHECKING:
   from apnpql_jax.agents.learner import Agent, make_agent

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 INTERRUPTED = 128  # plus the signal number: exit code of a run stopped by a signal
-FAILED = 3  # exit code of a run stopped by an error: disk full or values not finite
+FAILED = 3  # exit code of a run stopped by an error: disk full or non-finite updates
 
 
 class UserError(Exception):

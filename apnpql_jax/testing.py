@@ -1,6 +1,6 @@
 """Tiny but complete runs and random batches, for tests and benchmarks.
 
-Processes of such runs compile without optimization, which takes longer than it saves.
+Such runs compile without optimization, because optimizing takes longer than it saves.
 """
 
 from __future__ import annotations
@@ -63,11 +63,11 @@ TINY_ARGS = (
 def start(
   run_dir: Path,
   *args: str,
-  said: Path,
+  log: Path,
   log_compiles: bool = False,
   xla_flags: str = XLA_FLAGS,
 ) -> subprocess.Popen[bytes]:
-  """Trains in a new process, or resumes if ``run_dir`` is a run; output to ``said``."""
+  """Trains in a new process, or resumes if ``run_dir`` is a run; output to ``log``."""
   command = [sys.executable, "-m", "apnpql_jax", "train"]
   if (run_dir / "config.json").exists():
     command += ["--resume", str(run_dir)]
@@ -75,9 +75,9 @@ def start(
     command += ["push_plate", "--run", str(run_dir), *TINY_ARGS]
   env = os.environ | {"XLA_FLAGS": xla_flags, "PYTHONPATH": str(ROOT)}
   env |= {"JAX_LOG_COMPILES": "1"} if log_compiles else {}
-  with said.open("ab") as file:
+  with log.open("ab") as file:
     return subprocess.Popen(
-      [*command, *args], cwd=said.parent, env=env, stdout=file, stderr=file
+      [*command, *args], cwd=log.parent, env=env, stdout=file, stderr=file
     )
 
 

@@ -73,7 +73,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
 
 
 def _target(path: str, name: str) -> tuple[str, str]:
-  """Page and anchor that stand for ``name`` in a file of the repository."""
+  """Returns the page and anchor that stand for ``name`` in a file of the repository."""
   if not path.startswith(f"{PACKAGE.name}/"):
     return MOVED.get(path, path.removeprefix("docs/")), name
   module = path.removesuffix(".py").replace("/", ".")
@@ -81,14 +81,14 @@ def _target(path: str, name: str) -> tuple[str, str]:
 
 
 def _outside() -> dict[str, str]:
-  """Path in the site -> path in the repository, of pages from outside ``docs/``."""
+  """Returns path in the site -> path in the repository, of pages outside ``docs/``."""
   kept = (path for pattern in KEPT for path in ROOT.glob(pattern))
   same = {name: name for name in (str(path.relative_to(ROOT)) for path in kept)}
   return {site: source for source, site in MOVED.items()} | same
 
 
 def _reference() -> dict[str, list[str]]:
-  """Reference page -> modules on it: one page per package."""
+  """Returns reference page -> modules on it: one page per package."""
   pages: dict[str, list[str]] = {}
   for path in sorted(PACKAGE.rglob("*.py")):
     if path.stem.startswith("__"):
@@ -100,13 +100,13 @@ def _reference() -> dict[str, list[str]]:
 
 
 def _page_of(module: str) -> str:
-  """Reference page of a module: that of its package."""
+  """Returns the reference page of a module: that of its package."""
   package = module.split(".")[1:-1] or [PACKAGE.name]
   return f"reference/{'.'.join(package)}.md"
 
 
 def _pages() -> list[str]:
-  """Paths in the site of all pages, sorted, an index before the others."""
+  """Returns the paths in the site of all pages, sorted, an index before the others."""
   docs = (str(path.relative_to(ROOT / "docs")) for path in ROOT.glob("docs/**/*.md"))
   pages = {*docs, *_outside(), *_reference()}
   return sorted(pages, key=lambda page: (not page.endswith("index.md"), page[:-3]))

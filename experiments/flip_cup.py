@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from apnpql_jax.config.files import load_preset
+from apnpql_jax import load_preset
 
 _STACK = load_preset("stack_box")
 

@@ -1,6 +1,6 @@
 """Preset: push a plate to a mark, from pixels, on a 2-core CPU.
 
-Values that differ from the paper were found by experiment, see `experiments/log.md`.
+Values that differ from the paper were found by experiment; see `experiments/log.md`.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from apnpql_jax.config.files import load_preset
+from apnpql_jax import load_preset
 
 _PLACE = load_preset("place_plate")
 

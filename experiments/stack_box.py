@@ -1,13 +1,13 @@
 """Preset: stack the yellow box on the blue one, from pixels.
 
-Grasping needs the differences from push_plate, see `experiments/log.md`.
+Grasping needs the differences from push_plate; see `experiments/log.md`.
 """
 
 from __future__ import annotations
 
 import dataclasses
 
-from apnpql_jax.config.files import load_preset
+from apnpql_jax import load_preset
 
 _PUSH = load_preset("push_plate")
 

@@ -74,7 +74,7 @@ def rasterize(
   """Returns geom ids i32[n, H, W] and depths f32[n, H, W] by ``mujoco.Renderer``.
 
   Raises:
-    LookupError: no graphics library can be loaded.
+    LookupError: No graphics library can be loaded.
   """
   library = _graphics_library()
   if library is None:

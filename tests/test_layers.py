@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import ast
 from pathlib import Path
-import re
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
-PACKAGE = ROOT / "apnpql_jax"
+PACKAGE = Path(__file__).resolve().parents[1] / "apnpql_jax"
 NAME = PACKAGE.name
 
 STAIR = (
-  "version errors types runtime dists config devices sim render tasks "
+  "errors types runtime dists config devices sim render tasks "
   "randomization primitives envs agents data runs training testing cli __main__"
 ).split()
 """Rooms from the bottom up: each imports only from itself and from earlier ones."""
@@ -129,23 +127,3 @@ def test_distributions_import_nothing_else_of_the_package():
   members = [module for module in graph if room(module) == "dists"]
   outside = {x for m in members for x in graph[m] if room(x) != "dists"}
   assert members and not outside
-
-
-def test_tests_that_documents_name_exist():
-  files = {p.stem: p.read_text() for p in Path(__file__).parent.rglob("test_*.py")}
-  known = files.keys() | set(re.findall(r"def (test_\w+)\(", "".join(files.values())))
-  for document in (ROOT / "docs").rglob("*.md"):
-    named = set(re.findall(r"`(?:tests/[\w/]*)?(test_\w+)", document.read_text()))
-    assert named <= known, document
-
-
-def test_files_and_commands_that_documents_name_exist():
-  documents = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
-  for document in (*documents, *(ROOT / "experiments").rglob("*.md")):
-    text = document.read_text()
-    paths = set(re.findall(r"`((?:tests|benchmarks|apnpql_jax|docs)/[\w./]+)`", text))
-    modules = set(re.findall(r"python -m (benchmarks\.[\w.]+)", text))
-    paths |= {name.rstrip(".").replace(".", "/") + ".py" for name in modules}
-    missing = {path for path in paths if not (ROOT / path).exists()}
-    # The guide to a task of one's own names the files to make.
-    assert {path for path in missing if "touch_ball" not in path} == set(), document

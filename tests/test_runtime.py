@@ -147,12 +147,12 @@ def test_settings_that_come_too_late_are_an_error(also):
     "except apnpql_jax.UserError as error: print(error)\n"
     "assert os.environ == before"
   )
-  said = run(code)
+  output = run(code)
   if also:
-    assert said == ""
+    assert output == ""
   else:
-    assert "too late to set NPROC, XLA_FLAGS, JAX_COMPILATION_CACHE_DIR" in said
-    assert said.endswith("call configure() first\n")
+    assert "too late to set NPROC, XLA_FLAGS, JAX_COMPILATION_CACHE_DIR" in output
+    assert output.endswith("call configure() first\n")
 
 
 def test_quiet_warp_drops_only_its_two_lines(capsys):

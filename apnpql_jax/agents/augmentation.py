@@ -19,8 +19,8 @@ def augment(
 ) -> Transition:
   """Augments every image by ``shift_images`` and ``jitter_colors``; 0 turns one off.
 
-  Every instant is changed independently. With ``together``, all instants of a window
-  [B, L, ...] are changed alike, because an LSTM needs the differences between them.
+  Every instant changes independently. With ``together``, all instants of a window
+  [B, L, ...] change in the same way: an LSTM needs the differences between them.
   """
 
   def change(key: PRNGKeyArray, image: Array) -> Array:

@@ -77,7 +77,7 @@ class Encoder(nn.Module):
   without training it (prior, alpha) need not follow growing activations.
 
   The optional LSTM reads the features of the last L instants of an episode, from an
-  empty memory in acting and learning alike. Its last output is phi.
+  empty memory both in acting and in learning. Its last output is phi.
   """
 
   config: AgentConfig

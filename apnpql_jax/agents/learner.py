@@ -14,11 +14,11 @@ from jaxtyping import Float, Int, PRNGKeyArray
 import optax
 
 from apnpql_jax.agents import losses
+from apnpql_jax.agents.acting import choose_action
 from apnpql_jax.agents.augmentation import augment
 from apnpql_jax.agents.columns.candidates import Candidates
-from apnpql_jax.agents.columns.policy_evaluation import Evaluation
-from apnpql_jax.agents.heads import Heads, Networks, Params
-from apnpql_jax.agents.networks import make_networks
+from apnpql_jax.agents.columns.policy_evaluation import PolicyEvaluation
+from apnpql_jax.agents.networks import Heads, Networks, Params, make_networks
 from apnpql_jax.agents.table_one import Algorithm, algorithm_of, epsilon_bounds
 from apnpql_jax.config.checks import check_agent
 from apnpql_jax.config.schema import AgentConfig
@@ -29,11 +29,20 @@ from apnpql_jax.types import Array, Metrics, Observation, Transition
 class LearnerState(struct.PyTreeNode):
   """Complete state of the learner."""
 
-  params: Params  # one entry per group that the algorithm has
-  target_params: Params  # moving average of params; these act
-  nu: Float[Array, ""]  # multiplier >= 0 of the entropy floor
-  opt_state: Any  # of one Adam per learning rate
-  step: Int[Array, ""]  # updates done
+  params: Params
+  """Parameters, one entry per group that the algorithm has."""
+
+  target_params: Params
+  """Moving average of ``params``; these act."""
+
+  nu: Float[Array, ""]
+  """Multiplier >= 0 of the entropy floor."""
+
+  opt_state: Any
+  """State of one Adam per learning rate."""
+
+  step: Int[Array, ""]
+  """Number of updates done."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,17 +50,26 @@ class Agent:
   """Pure functions of one configuration; all can be jitted, scanned and sharded."""
 
   networks: Networks
-  evaluation: Evaluation
-  # (key, example observation with a batch axis) -> state before learning.
+  """The networks, without parameters."""
+
+  policy_evaluation: PolicyEvaluation
+  """How the algorithm represents and learns values."""
+
   init: Callable[[PRNGKeyArray, Observation], LearnerState]
-  # (params, observation [B], key, *, greedy=False) -> actions f32[B, 7], info f32[B]
-  # each: the action's log_prob, which Retrace needs, and for diagnosis its q, the
-  # candidates' q_max and ess, and alpha. ``greedy`` is a Python bool.
+  """(key, example observation with a batch axis) -> state before learning."""
+
   act: Callable[..., tuple[Array, Metrics]]
-  # (state, transitions [B], key) -> state after one update, metrics f32[].
+  """(params, observation [B], key, *, acting="policy") -> actions f32[B, 7], info.
+
+  ``acting`` names a rule, see ``acting.choose_action``. ``info`` holds f32[B] each: the
+  action's ``log_prob``, which Retrace needs, and for diagnosis its ``q``, the
+  candidates' ``q_max`` and ``ess``, and ``alpha``.
+  """
+
   update: Callable[
     [LearnerState, Transition, PRNGKeyArray], tuple[LearnerState, Metrics]
   ]
+  """(state, transitions [B], key) -> state after one update, metrics f32[]."""
 
 
 def make_agent(config: AgentConfig) -> Agent:
@@ -64,10 +82,13 @@ def make_agent(config: AgentConfig) -> Agent:
   algorithm = algorithm_of(config)
   groups = algorithm.groups(config)
   evaluation = algorithm.policy_evaluation(config)
-  networks = make_networks(config, groups, evaluation)
+  networks = make_networks(
+    config, groups, evaluation.head(config.hidden), evaluation.value
+  )
   optimizer = make_optimizer(config, groups)
   loss = functools.partial(total_loss, networks, algorithm, evaluation)
 
+  @jax.jit  # Operation by operation, it would take longer.
   def init(key: PRNGKeyArray, observation: Observation) -> LearnerState:
     params, nu = networks.init(key, observation), jnp.zeros(())
     target_params = jax.tree.map(jnp.copy, params)
@@ -79,10 +100,10 @@ def make_agent(config: AgentConfig) -> Agent:
     observation: Observation,
     key: PRNGKeyArray,
     *,
-    greedy: bool = False,
+    acting: str = "policy",
   ) -> tuple[Array, Metrics]:
     heads = networks.at(params, observation)
-    return sample_action(algorithm, heads, key, greedy=greedy)
+    return choose_action(algorithm, heads, key, acting=acting)
 
   def update(
     state: LearnerState, batch: Transition, key: PRNGKeyArray
@@ -104,18 +125,9 @@ def make_agent(config: AgentConfig) -> Agent:
     grads, metrics = jax.grad(loss, has_aux=True)(
       trained, state.target_params, batch, target, key_tm1
     )
-    # Step all optimizers, and keep nu nonnegative.
-    steps, opt_state = optimizer.update(grads, state.opt_state, trained)
-    params = jax.tree.map(jnp.add, trained, steps)
-    nu = jnp.maximum(params.pop("nu"), 0.0)
+    after = apply_gradients(optimizer, state, trained, grads, config.target_rate)
     metrics |= {f"grad_norm/{k}": optax.tree.norm(grads[k]) for k in groups}
-    metrics["prior/nu"] = nu
-    # Move the target network towards the new parameters.
-    rate = config.target_rate
-    target_params = jax.tree.map(
-      lambda new, old: old + rate * (new - old), params, state.target_params
-    )
-    return LearnerState(params, target_params, nu, opt_state, state.step + 1), metrics
+    return after, metrics | {"prior/nu": after.nu}
 
   return Agent(networks, evaluation, init, act, update)
 
@@ -144,36 +156,30 @@ def make_optimizer(
   return optax.partition({k: adam(rates[k]) for k in labels.values()}, labels)
 
 
-def sample_action(
-  algorithm: Algorithm, heads: Heads, key: PRNGKeyArray, *, greedy: bool
-) -> tuple[Array, Metrics]:
-  """Draws candidates and picks one by weight (paper Sec. III-B), see ``Agent.act``."""
-  key_candidates, key_pick = jax.random.split(key)
-  candidates = algorithm.policy(
-    heads,
-    algorithm.regularizer(heads, heads),
-    key_candidates,
-    num_samples=heads.config.policy_samples,
-    greedy=greedy,
+def apply_gradients(
+  optimizer: optax.GradientTransformation,
+  state: LearnerState,
+  trained: Params,
+  grads: Params,
+  target_rate: float,
+) -> LearnerState:
+  """Steps all optimizers and moves the target network toward the new parameters.
+
+  ``trained`` and ``grads`` are the parameter groups and nu, which stays nonnegative.
+  """
+  steps, opt_state = optimizer.update(grads, state.opt_state, trained)
+  params = jax.tree.map(jnp.add, trained, steps)
+  nu = jnp.maximum(params.pop("nu"), 0.0)
+  target_params = jax.tree.map(
+    lambda new, old: old + target_rate * (new - old), params, state.target_params
   )
-  q_values, weights = candidates.q_values, candidates.weights
-  chosen = boltzmann.pick(key_pick, weights)
-  actions = jnp.take_along_axis(candidates.actions, chosen[None, :, None], axis=0)
-  q = jnp.take_along_axis(q_values, chosen[None], axis=0)
-  info = {
-    "q": q[0],
-    "q_max": jnp.max(q_values, axis=0),
-    "alpha": heads.alpha(),
-    "ess": boltzmann.effective_sample_size(weights),
-    "log_prob": candidates.log_prob(actions, q)[0],
-  }
-  return actions[0], info
+  return LearnerState(params, target_params, nu, opt_state, state.step + 1)
 
 
 def bellman_target(
   networks: Networks,
   algorithm: Algorithm,
-  evaluation: Evaluation,
+  evaluation: PolicyEvaluation,
   target_params: Params,
   batch: Transition,
   key: PRNGKeyArray,
@@ -192,7 +198,7 @@ def bellman_target(
 def total_loss(
   networks: Networks,
   algorithm: Algorithm,
-  evaluation: Evaluation,
+  evaluation: PolicyEvaluation,
   trained: Params,
   target_params: Params,
   batch: Transition,

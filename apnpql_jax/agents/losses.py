@@ -10,13 +10,16 @@ paper's Algorithm 1.
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 import optax
 
-from apnpql_jax.dists import boltzmann, categorical
+from apnpql_jax.dists import categorical
 from apnpql_jax.dists.action import ActionDistribution
+from apnpql_jax.types import Array
 
 
 def weighted_mean(
@@ -67,7 +70,7 @@ def q_loss(
   logits_tm1: Float[Array, "*b n"], target: Float[Array, "*b n"]
 ) -> Float[Array, "*b"]:
   """Computes the cross-entropy L^Q = -sum_j Z-bar_j log Z(s_tm1, a_tm1)_j (Eq. 8)."""
-  return categorical.cross_entropy(target, logits_tm1)
+  return optax.losses.softmax_cross_entropy(logits_tm1, target)
 
 
 def retrace_target(
@@ -97,8 +100,13 @@ def alpha_loss(
   """Computes the dual of KL(q || b) <= epsilon, in nats, over alpha (paper Eq. 7).
 
   L^alpha = alpha epsilon + alpha log mean_i exp(Q_i / alpha), a_i ~ b
+
+  It is convex in alpha, with slope epsilon - KL(q || b), which is zero at the limit.
   """
-  return boltzmann.dual(jax.lax.stop_gradient(q_tm1), alpha_tm1, epsilon=epsilon)
+  q_tm1 = jax.lax.stop_gradient(q_tm1)
+  log_sum = jax.nn.logsumexp(q_tm1 / alpha_tm1[None], axis=0)
+  log_mean = log_sum - math.log(q_tm1.shape[0])
+  return alpha_tm1 * epsilon + alpha_tm1 * log_mean
 
 
 def kl_dual(

@@ -29,17 +29,9 @@ def mixture_from_outputs(
   closing the gripper to which an output is added; if None, outputs hold the means.
 
   Each row of a Cholesky factor is a direction times the standard deviation of that
-  joint (rad/s), ``initial_std`` for outputs of zero, within limits. Because the means
-  are fixed, a value that rises towards one side can make every M-step widen the
-  component, until most candidates are far from every primitive and their values are
-  guesses. Gripper commands keep a probability of ``min_prob``, and so do components
-  while one of the others is at its limit, because q cannot evaluate actions that the
-  prior no longer proposes. An entropy floor does not ensure this: a wide Gaussian
-  compensates for a gripper that never opens.
-
-  The limits are one-way clips, not squashing functions. In the first updates the values
-  are noise, and Adam drives the outputs far to one side at a speed that does not depend
-  on the gradient's size. A sigmoid or softmax never returns from there.
+  joint (rad/s), ``initial_std`` for outputs of zero. One-way clips limit standard
+  deviations, gripper probabilities and weights; see the decision "One-way clips in the
+  prior" in ``docs/decisions/learning.md``.
   """
   dim = ARM_DOF
   outputs = outputs.reshape(*outputs.shape[:-1], num, -1)
@@ -91,8 +83,8 @@ def _forward(x: Array, low: float, high: float) -> tuple[Array, Array]:
 
 def _backward(low: float, high: float, x: Array, grad: Array) -> tuple[Array]:
   # Descent moves x against the gradient: a negative one pushes it up.
-  outwards = ((x >= high) & (grad < 0)) | ((x <= low) & (grad > 0))
-  return (jnp.where(outwards, 0.0, grad),)
+  outward = ((x >= high) & (grad < 0)) | ((x <= low) & (grad > 0))
+  return (jnp.where(outward, 0.0, grad),)
 
 
 one_way_clip.defvjp(_forward, _backward)

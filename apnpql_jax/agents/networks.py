@@ -1,4 +1,4 @@
-"""The networks, built from the settings (paper Fig. 2 and Sec. IV-B).
+"""The networks and all their predictions (paper Fig. 2 and Sec. IV-B).
 
 The features phi are computed once per observation. The groups of parameters are
 encoder, ap (predicted primitives), z (value), alpha and, depending on the algorithm,
@@ -7,26 +7,153 @@ bp (the rest of the prior) and policy.
 
 from __future__ import annotations
 
-from apnpql_jax.agents.columns.policy_evaluation import Evaluation
+from collections.abc import Callable
+import dataclasses
+import math
+from typing import Any
+
+from flax import linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Float, PRNGKeyArray
+
 from apnpql_jax.agents.encoder import Encoder
-from apnpql_jax.agents.heads import Networks
-from apnpql_jax.agents.mixture_head import mixture_size
-from apnpql_jax.agents.modules import Constant, Head
+from apnpql_jax.agents.layers import MLP, Constant
+from apnpql_jax.agents.mixture_head import mixture_from_outputs, mixture_size
 from apnpql_jax.config.schema import AgentConfig
-from apnpql_jax.types import ACTION_DIM, NUM_PRIMITIVES
+from apnpql_jax.dists.gmm import GripperGMM
+from apnpql_jax.types import ACTION_DIM, NUM_PRIMITIVES, Array, Observation
+
+Params = dict[str, Any]  # by group; groups that an algorithm lacks are absent
+GROUPS = ("encoder", "ap", "bp", "z", "alpha", "policy")
+
+
+@dataclasses.dataclass(frozen=True)
+class Networks:
+  """The modules, one per group."""
+
+  modules: dict[str, nn.Module]
+  value: Callable[[Float[Array, "*b n"]], Float[Array, "*b"]]  # from z's outputs to Q
+  config: AgentConfig
+
+  def init(self, key: PRNGKeyArray, observation: Observation) -> Params:
+    """Initializes parameters, one entry per module, from an example batch."""
+    keys = dict(zip(GROUPS, jax.random.split(key, len(GROUPS)), strict=True))
+    batch = observation.robot.shape[:-1]
+    phi = jnp.zeros((*batch, self.config.feature_dim))
+    inputs: dict[str, tuple[Any, ...]] = dict.fromkeys(GROUPS, (phi,))
+    inputs["encoder"] = (observation,)
+    inputs["z"] = (phi, jnp.zeros((1, *batch, ACTION_DIM)))
+    return {k: m.init(keys[k], *inputs[k])["params"] for k, m in self.modules.items()}
+
+  def at(self, params: Params, observation: Observation) -> Heads:
+    """Returns the heads at a batch of states; only this method runs the encoder."""
+    return Heads(self, params, self.apply("encoder", params, observation))
+
+  def apply(self, group: str, params: Params, *inputs: Any) -> Any:
+    """Applies the module of ``group`` to ``inputs``."""
+    return self.modules[group].apply({"params": params[group]}, *inputs)
 
 
 def make_networks(
-  config: AgentConfig, groups: tuple[str, ...], evaluation: Evaluation
+  config: AgentConfig,
+  groups: tuple[str, ...],
+  value_head: nn.Module,
+  value: Callable[[Float[Array, "*b n"]], Float[Array, "*b"]],
 ) -> Networks:
-  """Builds the modules of ``groups``, with the sizes of ``config``."""
+  """Builds the modules of ``groups``, with the sizes of ``config``.
+
+  ``value_head`` and ``value`` are those of the policy evaluation.
+  """
   hidden, learned_mean = config.hidden, config.prior_mean == "learned"
   modules = {
     "encoder": Encoder(config),
-    "ap": Head(hidden, NUM_PRIMITIVES * ACTION_DIM),
-    "bp": Head(hidden, NUM_PRIMITIVES * mixture_size(own_mean=learned_mean)),
-    "z": evaluation.head(hidden),
-    "alpha": Constant() if config.temperature == "shared" else Head(hidden, 1),
-    "policy": Head(hidden, mixture_size(own_mean=True)),
+    "ap": MLP(hidden, NUM_PRIMITIVES * ACTION_DIM),
+    "bp": MLP(hidden, NUM_PRIMITIVES * mixture_size(own_mean=learned_mean)),
+    "z": value_head,
+    "alpha": Constant() if config.temperature == "shared" else MLP(hidden, 1),
+    "policy": MLP(hidden, mixture_size(own_mean=True)),
   }
-  return Networks({k: modules[k] for k in groups}, evaluation.value, config)
+  return Networks({k: modules[k] for k in groups}, value, config)
+
+
+@dataclasses.dataclass(frozen=True)
+class Heads:
+  """Networks, parameters and features bound together: all predictions at ``*b`` states.
+
+  Each prediction here determines which parameters it trains. Prior, policy and alpha
+  read phi without training it, because the E-step's loss has neither (paper Eq. 10).
+  """
+
+  networks: Networks
+  params: Params
+  phi: Float[Array, "*b feature_dim"]
+
+  @property
+  def config(self) -> AgentConfig:
+    """Settings of the networks."""
+    return self.networks.config
+
+  def frozen(self) -> Heads:
+    """Returns heads with equal predictions and without gradients to parameters."""
+    params, phi = jax.lax.stop_gradient((self.params, self.phi))
+    return dataclasses.replace(self, params=params, phi=phi)
+
+  def primitives(self) -> Float[Array, "*b 3 7"]:
+    """Predicts the action primitives theta^ap: velocities in rad/s, logit of closing.
+
+    They are unbounded: labels often lie at the bounds of [-1, 1], where a squashed
+    output would lose its gradient.
+    """
+    flat = self._apply("ap", self.phi)
+    return flat.reshape(*self.phi.shape[:-1], NUM_PRIMITIVES, ACTION_DIM)
+
+  def prior(self) -> GripperGMM:
+    """Returns the behavior prior b_theta; trains only the bp group.
+
+    Means are the predicted primitives, clipped to the action box (paper Sec. IV-A). The
+    M-step trains the rest of theta and must move neither the means nor phi.
+    """
+    return mixture_from_outputs(
+      self._apply("bp", jax.lax.stop_gradient(self.phi)),
+      None if self.config.prior_mean == "learned" else self.frozen().primitives(),
+      num=NUM_PRIMITIVES,
+      min_std=self.config.min_std,
+      initial_std=self.config.initial_std,
+      max_std=self.config.max_std,
+      min_prob=self.config.min_prob,
+      diagonal=self.config.diagonal_covariance,
+    )
+
+  def policy(self) -> GripperGMM:
+    """Returns the policy pi_psi, one component, not squashed; trains only its group."""
+    return mixture_from_outputs(
+      self._apply("policy", jax.lax.stop_gradient(self.phi)),
+      None,
+      num=1,
+      min_std=self.config.policy_min_std,
+      initial_std=self.config.policy_initial_std,
+      max_std=self.config.policy_max_std,
+      min_prob=self.config.policy_min_prob,
+      diagonal=self.config.diagonal_covariance,
+    )
+
+  def alpha(self) -> Float[Array, "*b"]:
+    """Returns the temperature > 0 of each state; trains only its own head."""
+    offset = math.log(math.expm1(self.config.initial_alpha))  # Inverse of softplus.
+    if self.config.temperature == "fixed":
+      raw = jnp.zeros(self.phi.shape[:-1])
+    else:
+      raw = self._apply("alpha", jax.lax.stop_gradient(self.phi))[..., 0]
+    return jax.nn.softplus(raw + offset) + self.config.min_alpha
+
+  def z(self, actions: Float[Array, " s *b 7"]) -> Float[Array, " s *b n"]:
+    """Returns the outputs of the value head."""
+    return self._apply("z", self.phi, actions)
+
+  def q(self, actions: Float[Array, " s *b 7"]) -> Float[Array, " s *b"]:
+    """Returns the expected return."""
+    return self.networks.value(self.z(actions))
+
+  def _apply(self, group: str, *inputs: Array) -> Any:
+    return self.networks.apply(group, self.params, *inputs)

@@ -11,7 +11,7 @@ from apnpql_jax.agents.columns.policy_evaluation import (
   TD0,
   Categorical,
   ClippedDoubleQ,
-  Evaluation,
+  PolicyEvaluation,
   Retrace,
 )
 from apnpql_jax.agents.columns.policy_update import (
@@ -29,7 +29,7 @@ from apnpql_jax.agents.columns.regularizer import (
   previous_policy,
   uniform,
 )
-from apnpql_jax.agents.heads import GROUPS
+from apnpql_jax.agents.networks import GROUPS
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.dists.action import ActionDistribution
 from apnpql_jax.errors import ConfigError, check_name
@@ -40,10 +40,10 @@ class Algorithm:
   """One row of Table I; the columns are functions."""
 
   regularizer: Callable[..., ActionDistribution]  # (heads, target network's heads) -> b
-  policy: Callable[..., Candidates]  # (heads, b, key, num_samples, greedy)
+  policy: Callable[..., Candidates]  # (heads, b, key, num_samples)
   regularizer_update: Callable[..., Losses]  # (heads, b, candidates, batch, key, nu)
   policy_update: Callable[..., Improvement]  # (heads, b, key)
-  policy_evaluation: Callable[[AgentConfig], Evaluation]
+  policy_evaluation: Callable[[AgentConfig], PolicyEvaluation]
 
   def groups(self, config: AgentConfig) -> tuple[str, ...]:
     """Returns the parameter groups that the columns read, in order of ``GROUPS``."""
@@ -76,7 +76,7 @@ ALGORITHMS = {
     behavior_prior,  cem,            fit_candidates,   none,       ClippedDoubleQ),
 }  # fmt: skip
 
-EVALUATIONS = {  # values of ``agent.policy_evaluation`` other than "row"
+POLICY_EVALUATIONS = {  # values of ``agent.policy_evaluation`` other than "row"
   "categorical": Categorical,
   "td0": TD0,
   "retrace": Retrace,
@@ -88,14 +88,15 @@ def algorithm_of(config: AgentConfig) -> Algorithm:
   """Returns the row that ``config`` names, with the columns that it replaces.
 
   Raises:
-    ConfigError: for an unknown row, or Retrace with a policy that has no density.
+    ConfigError: The row is unknown, or Retrace is combined with a policy that has no
+      density.
   """
   check_name("agent.algorithm", config.algorithm, tuple(ALGORITHMS))
   row = ALGORITHMS[config.algorithm]
   if config.regularizer == "uniform":
     row = dataclasses.replace(row, regularizer=uniform, regularizer_update=no_update)
   if config.policy_evaluation != "row":
-    evaluation = EVALUATIONS[config.policy_evaluation]
+    evaluation = POLICY_EVALUATIONS[config.policy_evaluation]
     row = dataclasses.replace(row, policy_evaluation=evaluation)
   if row.policy is cem and row.policy_evaluation is Retrace:
     raise ConfigError(

@@ -16,7 +16,7 @@ from apnpql_jax.config.checks import BACKENDS
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs import run_folder
-from apnpql_jax.runs.console import say
+from apnpql_jax.runs.console import print_line
 
 if TYPE_CHECKING:
   from jax.sharding import Mesh
@@ -33,7 +33,7 @@ def base_config(args: Train) -> TrainConfig:
   if args.resume is None:
     names = ", ".join(files.preset_names())
     raise ConfigError(f"train needs a preset; choose from {names}")
-  return run_folder.load_run_config(args.resume, say)
+  return run_folder.load_run_config(args.resume, print_line)
 
 
 def train(args: Train) -> Json:
@@ -62,7 +62,7 @@ def evaluate(args: Evaluate) -> Json:
   """Plays held-out episodes with a checkpoint of a run."""
   if not args.run:
     raise ConfigError("evaluate needs a run folder: apnpql evaluate RUN")
-  run_folder.load_run_config(Path(args.run), say)
+  run_folder.load_run_config(Path(args.run), print_line)
 
   from apnpql_jax.training.evaluate import evaluate as evaluate_run
 
@@ -72,7 +72,7 @@ def evaluate(args: Evaluate) -> Json:
     seed=args.seed,
     backend=args.backend,
     step=_checkpoint_step(args),
-    greedy=args.greedy,
+    acting=args.acting,
     video=args.video,
   )
 
@@ -113,11 +113,11 @@ def repeat(args: Repeat) -> Json:
   if not args.file:
     raise ConfigError("repeat needs a file: apnpql repeat RUN/faults/step_<n>.npz")
   path = Path(args.file).absolute()
-  run_folder.load_run_config(path.parent.parent, say)
+  run_folder.load_run_config(path.parent.parent, print_line)
 
-  from apnpql_jax.training import faults
+  from apnpql_jax.training import skipped_updates
 
-  return faults.repeat(path)
+  return skipped_updates.repeat(path)
 
 
 def list_names(args: List) -> Json:

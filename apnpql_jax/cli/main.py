@@ -11,21 +11,20 @@ import signal
 import sys
 from typing import Any
 
-from apnpql_jax import errors, runtime
+from apnpql_jax import __version__, errors, runtime
 from apnpql_jax.cli import commands, options
 from apnpql_jax.cli.commands import Json
 from apnpql_jax.cli.options import Train, parse
 from apnpql_jax.config import files
 from apnpql_jax.errors import ConfigError, UserError, check_name
-from apnpql_jax.runs.console import say
+from apnpql_jax.runs.console import print_line
 from apnpql_jax.runs.signals import Signals
-from apnpql_jax.version import __version__
 
 
 def main(argv: Sequence[str] | None = None) -> int:
   """Runs one command line and returns its exit code.
 
-  0 is success, 2 bad input, 3 a run that had to stop (disk full, values not finite),
+  0 is success, 2 bad input, 3 a run that had to stop (disk full, non-finite updates),
   130 Ctrl-C and 143 SIGTERM, with the run saved. All but 0 print one line to stderr.
   """
   runtime.configure()
@@ -48,10 +47,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         write(json.dumps(_plain(result)) if parsed.json else _show(result))
     return 0
   except UserError as error:
-    say(f"apnpql: {' '.join(str(error).split())}")
+    print_line(f"apnpql: {' '.join(str(error).split())}")
     return 2
   except errors.RunStopped as stop:
-    say(f"apnpql: {stop}")
+    print_line(f"apnpql: {stop}")
     if stop.code == errors.FAILED:
       # Threads of a failed save may wait for each other for minutes.
       os._exit(stop.code)

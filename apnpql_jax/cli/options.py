@@ -104,8 +104,9 @@ class Evaluate(_Play):
   checkpoint: str = "newest"
   """Checkpoint: newest, best (highest success rate in training) or its step."""
 
-  greedy: _Flag = False
-  """Take the best candidate, or a parametric policy's mean, instead of sampling."""
+  acting: Annotated[str | None, _default_hint("(default: as in training)")] = None
+  """How to choose an action: policy draws from the policy, mean takes the mean of its
+  likeliest component, prior draws from b without Q, greedy takes the highest Q."""
 
   backend: Annotated[str | None, _default_hint("(default: as in training)")] = None
   """Physics engine: auto, mjx or native."""
@@ -125,7 +126,8 @@ class Collect(_Play):
   """Standard deviation of the noise on the expert's joint velocities (rad/s)."""
 
   save: _File = None
-  """Also save as many episodes from training resets as a file of demonstrations."""
+  """Also record as many episodes, started from training resets, to this demonstrations
+  file."""
 
 
 @dataclasses.dataclass(frozen=True)

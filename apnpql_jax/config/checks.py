@@ -17,15 +17,17 @@ from apnpql_jax.errors import ConfigError, check_name
 
 BACKENDS = ("auto", "mjx", "native")
 OBSERVATIONS = ("pixels", "state")
-EVALUATIONS = ("row", "categorical", "td0", "retrace", "clipped_double_q")
+ACTING = ("policy", "mean", "prior", "greedy")
+POLICY_EVALUATIONS = ("row", "categorical", "td0", "retrace", "clipped_double_q")
 IMAGE_FEATURES = ("map", "keypoints", "both")
 
 _CHOICES = {
   "env.backend": BACKENDS,
   "env.obs": OBSERVATIONS,
+  "eval_acting": ACTING,
   "agent.temperature": ("state", "shared", "fixed"),
   "agent.regularizer": ("row", "uniform"),
-  "agent.policy_evaluation": EVALUATIONS,
+  "agent.policy_evaluation": POLICY_EVALUATIONS,
   "agent.prior_mean": ("primitives", "learned"),
   "agent.global_features": IMAGE_FEATURES,
   "agent.wrist_features": IMAGE_FEATURES,

@@ -42,11 +42,7 @@ def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
       yield prefix + field.name, value
 
 
-def ignore(line: str) -> None:
-  """Discards a message."""
-
-
-def from_json(cls: type[T], text: str, warn: Callable[[str], None] = ignore) -> T:
+def from_json(cls: type[T], text: str, warn: Callable[[str], None] | None = None) -> T:
   """Parses a nested dataclass, whose JSON may predate some ``added`` fields.
 
   Calls ``warn`` with one line that lists these fields, if any.
@@ -61,7 +57,7 @@ def from_json(cls: type[T], text: str, warn: Callable[[str], None] = ignore) -> 
     raise ConfigError(f"config is not valid JSON: {str(error)[:200]}") from None
   missing: list[str] = []
   config = _build(cls, data, "", missing)
-  if missing:
+  if missing and warn:
     names = ", ".join(missing)
     warn(f"older than some settings, which keep their old behavior: {names}")
   return config

@@ -67,7 +67,7 @@ def config_to_json(config: TrainConfig) -> str:
 
 
 def config_from_json(
-  text: str, warn: Callable[[str], None] = codec.ignore
+  text: str, warn: Callable[[str], None] | None = None
 ) -> TrainConfig:
   """Parses and validates the output of ``config_to_json``; see ``codec.from_json``.
 

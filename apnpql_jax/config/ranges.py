@@ -26,8 +26,8 @@ _MAX_ABSOLUTE = {
   "damping": 2.0,
   "delay_s": 1.0,
 }
-"""Upper limits in the units of the settings. Objects of larger variation in size or
-shape fit neither the hand nor the places they are put into."""
+"""Upper limits in the units of the settings. Objects outside these limits fit neither
+the hand nor their goal."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +43,7 @@ class RandomizationConfig:
 
   texture: float = 0.2
   """Largest color change by checkers and noise on robot, table, background and each
-  object, on a scale of 0 to 1. A third each are plain, checkered and noisy."""
+  object, on a scale of 0 to 1. Each is plain, checkered or noisy, at equal odds."""
 
   light_turn: float = 0.4
   """Direction of the light: each component of its unit vector."""

@@ -149,7 +149,7 @@ class AgentConfig:
   """Residual blocks per camera, none in the paper; slow on a CPU."""
 
   lstm_instants: int = codec.added(0)
-  """Time steps that an LSTM reads, each with its images (Fig. 2); 0: no LSTM."""
+  """Instants that an LSTM reads, each with its images (Fig. 2); 0: no LSTM."""
 
   global_features: str = codec.added("map")
   """Features of the global camera: map, keypoints (learn from fewer scenes) or both."""
@@ -191,11 +191,11 @@ class AgentConfig:
   """Upper bound of each joint's standard deviation in the parametric policy (rad/s)."""
 
   policy_min_prob: float = 0.001
-  """Lowest probability of a gripper command in the parametric policy."""
+  """Lower bound of gripper probabilities in the parametric policy."""
 
   min_prob: float = 0.05
-  """Lowest probability of a gripper command in the prior, and weight of a component at
-  its lower bound while another is at its upper bound; keeps all of them possible."""
+  """Lower bound of gripper probabilities in the prior and, within a factor of 2, of
+  component weights."""
 
   initial_alpha: float = 0.1
   """Initial temperature, added to min_alpha, in units of return."""
@@ -213,7 +213,7 @@ class ReplayConfig:
   """Agent replay and expert replay."""
 
   capacity: int = 51_200
-  """Slots of the agent replay over all worlds; a slot is one time step of one world."""
+  """Slots of the agent replay over all worlds; a slot is one instant of one world."""
 
   expert_steps: int = 6_400
   """Slots of the expert replay, filled by the scripted expert before training."""
@@ -263,6 +263,9 @@ class TrainConfig:
   eval_episodes: int = 64
   """Held-out episodes per evaluation."""
 
+  eval_acting: str = codec.added("policy")
+  """How evaluations choose an action: policy (draws), mean, prior or greedy."""
+
   checkpoint_every: int = 20_000
   """Environment steps between checkpoints."""
 
@@ -270,11 +273,12 @@ class TrainConfig:
   """Number of latest checkpoints to keep."""
 
   save_replay_every: int = 0
-  """Environment steps between checkpoints that include the replay; 0: all do. From one
-  without it, a run resumes with an older replay and is not bit-exact."""
+  """Environment steps between checkpoints that include the replay; 0: all do. A run
+  resumed from a checkpoint without a replay uses an older one and is not
+  bit-identical."""
 
   max_skipped_updates: int = 100
-  """The run stops after skipping this many updates in a row for NaN or infinity."""
+  """Stop the run after this many consecutive non-finite (skipped) updates."""
 
   video: bool = True
   """Write a video of evaluation episodes."""

@@ -45,7 +45,7 @@ def save(
   """Writes a demonstration file; returns its name and counts.
 
   Raises:
-    FileError: the file cannot be written.
+    FileError: The file cannot be written.
   """
   arrays: dict[str, Any] = {"format": FORMAT, "version": VERSION, "task": task}
   arrays |= {"control_period_s": control_period_s, **demos._asdict()}
@@ -62,7 +62,8 @@ def load(path: Path, task: Task, control_period_s: float) -> Demonstrations:
   """Reads and checks a demonstration file.
 
   Raises:
-    FileError: another format, version, task or control period, or an invalid state.
+    FileError: The file has another format, version, task or control period, or an
+      invalid state.
   """
   arrays = npz.read(path, limit=devices.host_memory() or 1 << 32)
   fields = Demonstrations._fields
@@ -91,7 +92,7 @@ def check(demos: Demonstrations, scene: Scene) -> None:
   """Checks shapes and values against the scene.
 
   Raises:
-    FileError: names the array and the first instant of an invalid value.
+    FileError: A value is invalid; the message names its array and first instant.
   """
   model, n = scene.model, demos.first.size
   variants = min((len(v) for v in scene.variants.values()), default=1)

@@ -22,8 +22,8 @@ def read(path: Path, *, limit: int) -> dict[str, np.ndarray]:
   """Reads all arrays of an archive without executing anything in it.
 
   Raises:
-    FileError: the file is no archive of arrays, is damaged, holds Python objects, or
-      takes more than ``limit`` bytes.
+    FileError: The file is not an archive of arrays, is damaged, holds Python objects,
+      or takes more than ``limit`` bytes.
   """
   try:
     with zipfile.ZipFile(path) as archive:
@@ -35,7 +35,7 @@ def read(path: Path, *, limit: int) -> dict[str, np.ndarray]:
   except UserError:
     raise
   except _ERRORS as error:
-    raise FileError(f"{path} is no archive of arrays: {one_line(error)}") from None
+    raise FileError(f"{path} is not an .npz archive: {one_line(error)}") from None
 
 
 def _nbytes(archive: zipfile.ZipFile, name: str) -> int:
@@ -46,7 +46,7 @@ def _nbytes(archive: zipfile.ZipFile, name: str) -> int:
       raise ValueError(f"{name}: unknown version {version}")
     shape, _, dtype = np.lib.format.read_array_header_1_0(file)
   if dtype.hasobject or any(n < 0 for n in shape):
-    raise ValueError(f"{name}: {dtype}{list(shape)} is no plain array")
+    raise ValueError(f"{name}: {dtype}{list(shape)} is not a plain array")
   return math.prod(shape) * dtype.itemsize
 
 

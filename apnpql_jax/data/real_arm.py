@@ -28,7 +28,7 @@ def convert(path: Path, scene: Scene, *, period_s: float) -> Demonstrations:
   """Reads a recording (``docs/demonstrations.md``) and samples it every ``period_s``.
 
   Raises:
-    FileError: poses are missing, a shape is wrong, or the arm moves too fast.
+    FileError: Poses are missing, a shape is wrong, or the arm moves too fast.
   """
   arrays = _read(path, scene.model)
   variant, episode = arrays.pop("variant"), arrays.pop("episode")
@@ -132,7 +132,7 @@ def _actions(joints: np.ndarray, gripper: np.ndarray, period_s: float) -> np.nda
   if abs(velocity).max(initial=0.0) > 1.05 * MAX_VELOCITY:
     raise FileError(
       f"the arm moves at {abs(velocity).max():.2f} rad/s, but actions are limited to "
-      f"{MAX_VELOCITY} rad/s; record it slower"
+      f"{MAX_VELOCITY} rad/s; record it more slowly"
     )
   action[:-1, :6] = velocity.clip(-MAX_VELOCITY, MAX_VELOCITY)
   action[:, 6] = _commands(gripper.clip(0.0, 1.0))

@@ -13,7 +13,7 @@ from typing import Any
 from flax import struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Int, PRNGKeyArray
 import numpy as np
 
 from apnpql_jax.types import Array, Slot, Transition
@@ -26,7 +26,7 @@ class Replay(struct.PyTreeNode):
 
   slots: Slot  # [length, worlds, ...]
   cursor: Int[Array, ""]  # next time index to write; the oldest one once full
-  size: Int[Array, ""]  # stored time steps, at most length
+  size: Int[Array, ""]  # stored instants per world, at most length
 
 
 def create(example_slot: Slot, length: int, worlds: int) -> Replay:
@@ -39,14 +39,14 @@ def create(example_slot: Slot, length: int, worlds: int) -> Replay:
 
 
 def add(replay: Replay, chunk: Slot) -> Replay:
-  """Writes a chunk [T, worlds, ...], oldest first, over the oldest time steps.
+  """Writes a chunk [T, worlds, ...], oldest first, over the oldest instants.
 
   All chunks of a ring have the same T, so no write crosses its end. The write is in
   place if the replay is donated and is sampled only afterwards.
   """
   length, steps = replay.slots.action.shape[0], chunk.action.shape[0]
   if not steps or length % steps:
-    raise ValueError(f"a chunk of {steps} steps does not divide {length} time steps")
+    raise ValueError(f"a chunk of {steps} instants does not divide a ring of {length}")
 
   def write(ring: Array, new: Array) -> Array:
     expected = (steps, *ring.shape[1:])
@@ -91,7 +91,7 @@ def can_sample(replay: Replay, *, n_step: int) -> Bool[Array, ""]:
 
 def sample(
   replay: Replay,
-  key: Array,
+  key: PRNGKeyArray,
   *,
   batch_size: int,
   n_step: int,
@@ -149,7 +149,7 @@ def expert_count(batch_size: int, expert_share: float) -> int:
 def sample_mixed(
   agent_replay: Replay,
   expert_replay: Replay | None,
-  key: Array,
+  key: PRNGKeyArray,
   *,
   batch_size: int,
   expert_share: float,
@@ -179,7 +179,7 @@ def sample_mixed(
 
 
 def _draw_starts(
-  replay: Replay, key: Array, batch_size: int, n_step: int, before: int
+  replay: Replay, key: PRNGKeyArray, batch_size: int, n_step: int, before: int
 ) -> tuple[Array, Array, Array]:
   """Draws starts by rejection: time index, world and validity, each [B].
 

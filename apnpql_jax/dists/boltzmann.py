@@ -28,18 +28,6 @@ def effective_sample_size(weights: Float[Array, " s *b"]) -> Float[Array, "*b"]:
   return 1.0 / jnp.sum(jnp.square(weights), axis=0)
 
 
-def dual(
-  q_values: Float[Array, " s *b"], alpha: Float[Array, "*b"], *, epsilon: float
-) -> Float[Array, "*b"]:
-  """Returns the dual of max_q E_q[Q] subject to KL(q || b) <= epsilon (paper Eq. 7).
-
-  It is convex in alpha, with slope epsilon - KL(q || b), which is zero at the limit.
-  """
-  log_sum = jax.nn.logsumexp(q_values / alpha[None], axis=0)
-  log_mean = log_sum - math.log(q_values.shape[0])
-  return alpha * epsilon + alpha * log_mean
-
-
 def pick(key: PRNGKeyArray, weights: Float[Array, " s *b"]) -> Int[Array, "*b"]:
   """Draws the index of one candidate per state with probabilities ``weights``."""
   return jax.random.categorical(key, jnp.log(weights), axis=0)

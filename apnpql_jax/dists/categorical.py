@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 import numpy as np
@@ -37,13 +36,6 @@ def project(
   distance = jnp.abs(atoms.reshape(shape + (1,)) - moved[..., None, :])
   share = jnp.maximum(1.0 - distance / (atoms[1] - atoms[0]), 0.0)
   return jnp.sum(share * probs[..., None, :], axis=-1)
-
-
-def cross_entropy(
-  probs: Float[Array, "*b n"], logits: Float[Array, "*b n"]
-) -> Float[Array, "*b"]:
-  """Returns -sum_j p_j log softmax(logits)_j."""
-  return -jnp.sum(probs * jax.nn.log_softmax(logits), axis=-1)
 
 
 def broadest_logits(

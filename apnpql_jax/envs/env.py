@@ -2,8 +2,8 @@
 
 All functions are pure over ``EnvState`` and can run inside jit; the world axis comes
 first. A step from a terminal instant ignores the action and resets that world to a
-random row of the bank, so that terminal observations reach the replay. A world whose
-state is not finite is reset in the same way, and counted.
+random row of the bank, so that terminal observations reach the replay. A non-finite
+world is reset in the same way, and counted.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ HELD_OUT_SHARE = 0.25  # share of the bank's rows that is reserved for evaluatio
 
 
 class Env:
-  """The worlds of one task. It holds constants only, its state is an ``EnvState``.
+  """The worlds of one task. Holds only constants; the state is an ``EnvState``.
 
   ``reset`` and ``step`` consist of two halves each:
 
@@ -139,7 +139,7 @@ class Env:
     return arrival.replace(faults=state.faults + broken)
 
   def observe(self, arrival: Arrival) -> EnvState:
-    """Rewards, labels and observes an instant: second half of both."""
+    """Computes reward, labels, observation: second half of ``reset`` and ``step``."""
     state = self._observe(arrival.replace(recent=None))
     if arrival.recent is None:
       return state
@@ -174,7 +174,7 @@ class Env:
     """Repeats L times, [worlds, ...] -> [worlds, L, ...]."""
     return jnp.repeat(x[:, None], self._instants, axis=1)
 
-  def _initial(self, rows: Array, keys: Array) -> PhysicsState:
+  def _initial(self, rows: Array, keys: PRNGKeyArray) -> PhysicsState:
     """Returns worlds at rest at rows of the bank, randomized if configured."""
     bank = self._bank
     drawn = bank.qpos, bank.mocap_pos, bank.mocap_quat, bank.variant
@@ -187,7 +187,7 @@ class Env:
     """Checks that all values are finite and that the engine has not reset the world."""
     leaves = jax.tree.leaves((before.physics, before.targets, action, moved))
     finite = [jnp.isfinite(x).all(tuple(range(1, x.ndim))) for x in leaves]
-    # C MuJoCo silently resets a world that is not finite, and its clock with it.
+    # C MuJoCo silently resets a non-finite world, and its clock with it.
     return jnp.stack(finite).all(0) & (moved.time > before.physics.time)
 
   def _judge_and_observe(self, arrival: Arrival) -> EnvState:
@@ -238,8 +238,8 @@ def make_env(config: EnvConfig, mesh: Mesh | None = None, *, instants: int = 0) 
   ``instants`` is ``agent.lstm_instants`` of the agent that acts in it.
 
   Raises:
-    ConfigError: A setting is invalid, the scene cannot be simulated or drawn, or it
-      has too few usable resets.
+    ConfigError: A setting is invalid, the scene cannot be simulated or drawn, or too
+      few resets are usable.
   """
   check_env(config)
   task = make_task(config.task)

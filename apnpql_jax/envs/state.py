@@ -14,12 +14,23 @@ class EnvState(struct.PyTreeNode):
   """The complete state of the worlds at an observed instant."""
 
   physics: PhysicsState
-  targets: Float[Array, "worlds 3 6"]  # joint targets of the primitives, rad
-  elapsed: Int[Array, " worlds"]  # control periods since the reset
+  """State of the simulation."""
+
+  targets: Float[Array, "worlds 3 6"]
+  """Joint targets of the primitives, rad."""
+
+  elapsed: Int[Array, " worlds"]
+  """Control periods since the reset."""
+
   timestep: TimeStep
-  faults: Int[Array, " worlds"]  # resets because a value was not finite
-  # [worlds, L, ...], for agents with an LSTM; short episodes repeat their first.
+  """The instant: observation, reward, end of the episode, labels."""
+
+  faults: Int[Array, " worlds"]
+  """Number of resets because of a non-finite value."""
+
   recent: Observation | None = None
+  """Last L observations [worlds, L, ...], for agents with an LSTM. An episode of fewer
+  instants repeats its first."""
 
   @property
   def observation(self) -> Observation:
@@ -31,12 +42,25 @@ class Arrival(struct.PyTreeNode):
   """An instant that the worlds have reached but that is not observed yet."""
 
   physics: PhysicsState
-  targets: Float[Array, "worlds 3 6"]  # joint targets of the instant before, rad
-  elapsed: Int[Array, " worlds"]  # control periods since the reset
-  fresh: Bool[Array, " worlds"]  # an episode begins here
-  history: Float[Array, "worlds 21"]  # robot states of the instant before
-  faults: Int[Array, " worlds"]  # as in ``EnvState``
-  recent: Observation | None  # [worlds, L, ...], of the instant before
+  """State of the simulation."""
+
+  targets: Float[Array, "worlds 3 6"]
+  """Joint targets of the primitives at the instant before, rad."""
+
+  elapsed: Int[Array, " worlds"]
+  """Control periods since the reset."""
+
+  fresh: Bool[Array, " worlds"]
+  """Whether an episode begins here."""
+
+  history: Float[Array, "worlds 21"]
+  """Robot states at the instant before, as in ``Observation.robot``."""
+
+  faults: Int[Array, " worlds"]
+  """Number of resets because of a non-finite value."""
+
+  recent: Observation | None
+  """Last L observations [worlds, L, ...] at the instant before."""
 
   @classmethod
   def after(

@@ -57,13 +57,13 @@ class ResetBank(struct.PyTreeNode):
 
   @property
   def rows(self) -> int:
-    """Returns the number of reset states."""
+    """Number of reset states."""
     return self.qpos.shape[0]
 
 
 @dataclasses.dataclass
 class BankReport:
-  """Statistics of building a bank."""
+  """Statistics of the construction of a bank."""
 
   drawn: int = 0
   rejected_restless: int = 0  # moved or still moving: objects overlapped
@@ -105,7 +105,7 @@ def build_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
   """Draws, settles and solves ``rows`` reset states; shows progress on stderr.
 
   Raises:
-    ConfigError: too many draws were rejected.
+    ConfigError: Too many draws were rejected.
   """
   began = time.monotonic()
   rng = np.random.default_rng(SEED)

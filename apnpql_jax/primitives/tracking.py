@@ -17,8 +17,7 @@ from apnpql_jax.types import Array
 
 GAIN = 2.0  # 1/s, close to the target
 # rad/s^2, far from the target: v = sqrt(2 a d) stops within d. Below the limit of 1.2
-# because a command is held for 0.15 s. Without this profile a gain of 2.0 overshoots
-# by 0.06 rad from full speed; the largest gain that does not is 1.7.
+# because a command is held for 0.15 s. GAIN alone would overshoot by 0.06 rad.
 BRAKING = 0.7
 DAMPING = 1e-3  # m or rad; far below the Jacobian's singular values in the workspace
 REFINE_STEPS = 4  # per control period; two reduce a jump of 10 cm to below 1 mm
@@ -28,7 +27,7 @@ MAX_REFINEMENT = 0.3  # rad; longest joint step, a trust region near singulariti
 def follow(
   target: Float[Array, "*b 6"], q: Float[Array, "*b 6"]
 ) -> Float[Array, "*b 6"]:
-  """Returns velocities (rad/s) towards joint angles; one factor scales all joints."""
+  """Returns velocities (rad/s) toward joint angles; one factor scales all joints."""
   error = target - q
   farthest = jnp.abs(error).max(-1, keepdims=True)
   speed = jnp.minimum(GAIN * farthest, jnp.sqrt(2 * BRAKING * farthest))
@@ -43,7 +42,7 @@ def refine(
   pos: Float[Array, "*b 3"],
   mat: Float[Array, "*b 3 3"],
 ) -> Float[Array, "*b 6"]:
-  """Moves joint targets (rad) towards tool poses by damped least squares.
+  """Moves joint targets (rad) toward tool poses by damped least squares.
 
   Starts from the last target, or from the present configuration if that is nearer to
   the pose. After a jump of the pose, as when an object has been grasped, steps from a

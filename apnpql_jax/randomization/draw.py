@@ -6,6 +6,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
 import mujoco
 import numpy as np
 
@@ -19,7 +20,7 @@ from apnpql_jax.types import Array
 class Draw:
   """Random numbers of one world, from a separate stream for each setting."""
 
-  key: Array
+  key: PRNGKeyArray
   config: RandomizationConfig
 
   def uniform(self, name: str, shape: tuple[int, ...] = ()) -> Array:

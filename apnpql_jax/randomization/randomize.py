@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
 import numpy as np
 
 from apnpql_jax.config.ranges import RandomizationConfig
@@ -28,7 +29,7 @@ Randomize = Callable[[PhysicsState, Array], PhysicsState]  # of states at rest a
 def make_randomize(config: RandomizationConfig, scene: Scene) -> Randomize:
   """Returns the function that draws a world for each episode."""
 
-  def one(state: PhysicsState, key: Array) -> PhysicsState:
+  def one(state: PhysicsState, key: PRNGKeyArray) -> PhysicsState:
     draw, world = Draw(key, config), World(scene.model, state.fields)
     visuals.color(draw, world)
     visuals.texture(draw, world)

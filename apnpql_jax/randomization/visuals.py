@@ -26,7 +26,7 @@ def color(draw: Draw, world: World) -> None:
 
 
 def texture(draw: Draw, world: World) -> None:
-  """Makes a third each of the groups and backgrounds plain, checkered and noisy."""
+  """Makes each group and the background plain, checkered or noisy, at equal odds."""
   if not draw.config.texture:
     return
   model, count = world.model, world.model.nbody + 1

@@ -35,7 +35,7 @@ class Geoms:
     """Reads the visible geoms: alpha above zero; default groups as in MuJoCo's viewer.
 
     Raises:
-      ConfigError: a visible geom has a type without closed-form intersection, or a
+      ConfigError: A visible geom has a type without closed-form intersection, or a
         texture other than a checker on a plane.
     """
     rgba = _effective_rgba(model)
@@ -83,7 +83,8 @@ class CameraSpec:
     """Reads a camera by name.
 
     Raises:
-      ConfigError: the camera is missing or not plain perspective, or the image empty.
+      ConfigError: The camera is missing or not plain perspective, or the image is
+        empty.
     """
     names = [model.camera(i).name for i in range(model.ncam)]
     if name not in names:
@@ -101,7 +102,7 @@ class CameraSpec:
 class Lighting:
   """Ambient light, one directional light, background and shadows.
 
-  Intensity on a surface with unit normal n, where l points towards the light, is
+  Intensity on a surface with unit normal n, where l points toward the light, is
   ``ambient + diffuse * max(n.l, -fill * n.l)``; without ``fill`` all surfaces that face
   away would have one flat color. Seen from the light, every shadow receiver must lie
   behind every caster, as a table lies under a gripper. No casters, no cost.
@@ -134,7 +135,7 @@ class Lighting:
     """Takes the direction of the model's light; ``settings`` are other fields.
 
     Raises:
-      ConfigError: there is not exactly one directional light, or a body carries it.
+      ConfigError: There is not exactly one directional light, or a body carries it.
     """
     lights = np.flatnonzero(model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     if len(lights) != 1 or model.light_bodyid[lights[0]] != 0:

@@ -43,7 +43,7 @@ class Frames(NamedTuple):
   z: Float[Array, "n 3"]
   center: Float[Array, "n 3"]  # in the camera's frame, m
   offset: Float[Array, "n 3"]  # the same in the geom's own frame, m
-  light: Float[Array, "n 3"]  # unit vector towards the light in the geom's own frame
+  light: Float[Array, "n 3"]  # unit vector toward the light in the geom's own frame
   center_light: Float[Array, " n"]  # inner product of center and light, m
   center_norm2: Float[Array, " n"]  # squared distance of the center, m^2
   size: Float[Array, "n 3"]  # MuJoCo half sizes, m

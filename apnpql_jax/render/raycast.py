@@ -64,7 +64,7 @@ def render(
   Poses are in the world; ``fields`` are values per world of some ``appearance.FIELDS``.
 
   Raises:
-    ValueError: an output is unknown, the shapes do not match, a shadow caster is not
+    ValueError: An output is unknown, the shapes do not match, a shadow caster is not
       a drawn sphere, capsule or box, or a shadow receiver is not drawn.
   """
   if not outputs or not set(outputs) <= set(OUTPUTS):

@@ -20,7 +20,7 @@ from apnpql_jax.types import Array
 
 
 def light_basis(direction: Any, xp: Any = np) -> Any:
-  """Returns f32[3, 3]: rows e1, e2 across the light and l towards it, in world axes."""
+  """Returns f32[3, 3]: rows e1, e2 across the light and l toward it, in world axes."""
   toward = -xp.asarray(direction)
   toward = toward / xp.linalg.norm(toward)
   helper = xp.eye(3)[xp.argmin(xp.abs(toward))]

@@ -38,9 +38,9 @@ def apply_texture(
 ) -> Array:
   """Returns the paint f32[P], see ``raycast``, with the texture at the depths t.
 
-  Textures are evaluated once per pixel, for the visible point. Evaluated at each
-  intersection they took sixteen times as long: XLA did not compile the fold over the
-  geoms into one loop.
+  Evaluates textures once per pixel, for the visible point. Evaluating them at each
+  intersection takes sixteen times as long, because XLA does not compile the fold over
+  the geoms into one loop.
   """
   waves, grain = texture
   axes = jnp.stack([frames.x, frames.y, frames.z], axis=1)

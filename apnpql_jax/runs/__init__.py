@@ -1,1 +1,1 @@
-"""Run folders and what lies in them: checkpoints, metrics, locks."""
+"""Run folders and their contents: checkpoints, metrics, locks."""

@@ -114,7 +114,8 @@ def _step_with(run_dir: Path, last: int, item: str) -> int:
   holding = [step for step, record in records.items() if item in record.items]
   step = newest_until(last, holding)
   if step is None:
-    raise DamagedError(f"{title(run_dir, last)} and those before it lack the {item}")
+    name = title(run_dir, last)
+    raise DamagedError(f"neither {name} nor an earlier checkpoint has the {item}")
   return step
 
 

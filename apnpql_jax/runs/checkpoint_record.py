@@ -66,8 +66,8 @@ def read(run_dir: Path, step: int) -> Record:
   """Returns the record of a checkpoint.
 
   Raises:
-    DamagedError: the record is missing or differs from what was written.
-    FileError: the record has another format.
+    DamagedError: The record is missing or differs from what was written.
+    FileError: The record has another format.
   """
   path = folder(run_dir) / str(step) / "meta" / "metadata"
   name = title(run_dir, step)

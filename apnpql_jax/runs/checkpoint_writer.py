@@ -18,7 +18,7 @@ from apnpql_jax.runs import checkpoint_record, leaves
 from apnpql_jax.runs.checkpoint_record import best, newest_until
 
 _CHUNK_BYTES = 16 << 20
-"""Unit of compression; a replay in one chunk kept a core busy twice as long."""
+"""Unit of compression; a replay in one chunk keeps a core busy twice as long."""
 
 
 class SaveError(OSError):
@@ -26,7 +26,7 @@ class SaveError(OSError):
 
 
 class CheckpointWriter:
-  """Saves the checkpoints of one run and deletes those that are no longer needed.
+  """Writer of the checkpoints of one run, which deletes those no longer needed.
 
   Use as a context manager: leaving it waits until the last save is on disk, unless a
   save has failed. A checkpoint becomes visible only once it is complete.
@@ -57,29 +57,27 @@ class CheckpointWriter:
 
   def save(
     self, step: int, items: Mapping[str, Any], *, success_rate: float | None = None
-  ) -> bool:
+  ) -> None:
     """Starts writing ``items``; they may be donated as soon as this returns.
 
-    Waits for the previous save first. On a CPU, JAX replaces donated buffers that are
-    still being read, which takes memory for a second state.
+    Waits for the previous save first. Does nothing if this step has already been saved.
+    On a CPU, JAX replaces donated buffers that are still being read, which takes memory
+    for a second state.
 
     Args:
-      step: environment steps done.
-      items: name -> pytree of arrays, including typed PRNG keys.
-      success_rate: decides which checkpoint is the best; None if not evaluated.
-
-    Returns:
-      False, without writing, if this step has already been saved.
+      step: Environment steps done.
+      items: Name -> pytree of arrays, including typed PRNG keys.
+      success_rate: Decides which checkpoint is the best; None if not evaluated.
 
     Raises:
-      SaveError: this save cannot be started, or the previous one failed.
+      SaveError: This save cannot be started, or the previous one failed.
     """
     import jax
     import orbax.checkpoint as ocp
 
     self.wait()
     if step in self._manager.all_steps():
-      return False
+      return
     self._saving = step, time.monotonic()
     record = checkpoint_record.describe(self._config, items, success_rate)
     parts: dict[str, Any] = {"meta": ocp.args.JsonSave(record)}
@@ -90,7 +88,7 @@ class CheckpointWriter:
       parts[name] = ocp.args.StandardSave(plain, save_args=args)
     self._policy.rates[step], self._policy.items[step] = success_rate, set(items)
     try:
-      return self._manager.save(step, args=ocp.args.Composite(**parts), force=True)
+      self._manager.save(step, args=ocp.args.Composite(**parts), force=True)
     except Exception as error:
       raise self._failed(error) from error
 
@@ -100,7 +98,7 @@ class CheckpointWriter:
     With ``wait``, waits for a save in progress.
 
     Raises:
-      SaveError: the save failed.
+      SaveError: The save failed.
     """
     if self._saving is None or not wait and self._manager.is_saving_in_progress():
       return {}
@@ -115,7 +113,7 @@ class CheckpointWriter:
     """Waits until everything saved is on disk.
 
     Raises:
-      SaveError: a save failed.
+      SaveError: A save failed.
     """
     try:
       self._manager.wait_until_finished()
@@ -154,8 +152,8 @@ class CheckpointWriter:
 class _KeepNewestAndBest:
   """Orbax policy that keeps the newest checkpoints, their items, and the best one.
 
-  Orbax's own policies do not see items, and its BestN reads the rate from an item that
-  existing checkpoints lack.
+  Orbax's own policies do not see items, and its BestN reads the rate from an item of
+  its own instead of the record.
   """
 
   def __init__(self, run_dir: Path, keep: int):
@@ -165,6 +163,7 @@ class _KeepNewestAndBest:
     self.items = {step: set(record.items) for step, record in records.items()}
 
   def should_preserve(self, checkpoints: Sequence[Any], **_: Any) -> list[bool]:
+    """Returns for each checkpoint whether to keep it; called by Orbax."""
     steps = sorted(info.step for info in checkpoints)
     newest = steps[-self._keep :]
     kept = {*newest, best({step: self.rates.get(step) for step in steps})}

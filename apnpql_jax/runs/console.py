@@ -6,7 +6,7 @@ import contextlib
 import sys
 
 
-def say(line: str) -> None:
+def print_line(line: str) -> None:
   """Prints a line to standard error; ignores failures to write."""
   with contextlib.suppress(OSError):
     print(line, file=sys.stderr, flush=True)

@@ -28,7 +28,7 @@ def fill(example: Any, arrays: Mapping[str, Any]) -> Any:
   """Undoes ``named``: returns a tree like ``example`` with ``arrays`` as its leaves.
 
   Raises:
-    KeyError: an array is missing.
+    KeyError: An array is missing.
   """
   return jax.tree_util.tree_map_with_path(lambda p, _: arrays[_name(p)], example)
 
@@ -93,8 +93,8 @@ def to_typed(tree: Any, impls: Mapping[str, str], example: Any) -> Any:
   """Undoes ``to_plain``, given the generators (path -> name) and the original shapes.
 
   Raises:
-    ValueError: the generators do not fit the keys.
-    TypeError: a generator is unknown.
+    ValueError: The generators do not fit the keys.
+    TypeError: A generator is unknown.
   """
 
   def restored(path: Any, like: Any, leaf: jax.Array | None) -> jax.Array:

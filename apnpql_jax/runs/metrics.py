@@ -52,7 +52,7 @@ class Sink(Protocol):
 
 
 class MetricWriter:
-  """Appends rows to ``metrics.jsonl``; each is on disk when ``write`` returns.
+  """Writer of ``metrics.jsonl``; each row is on disk when ``write`` returns.
 
   A file that has grown too large is renamed to ``metrics.<n>.jsonl``, starting at 1.
   """
@@ -83,7 +83,7 @@ class MetricWriter:
   def write(self, step: int, metrics: Mapping[str, Any]) -> None:
     """Adds a row of numbers or arrays of one element.
 
-    Values that are not finite become null in the file.
+    Non-finite values become null in the file.
     """
     numbers = {name: _number(value) for name, value in metrics.items()}
     row: Row = {STEP: step, WALL: round(self._clock() - self._start, 3), **numbers}
@@ -166,17 +166,15 @@ def read_rows(path: Path, *, having: str = "") -> list[Row]:
   return rows
 
 
-def plot_curve(rows: Sequence[Row], path: Path, *, title: str = "") -> bool:
+def plot_curve(rows: Sequence[Row], path: Path, *, title: str = "") -> None:
   """Draws the success rate over environment steps and over wall-clock minutes.
 
-  The band is the 95 % interval, for rows that hold the number of episodes.
-
-  Returns:
-    False, without drawing, if no row is an evaluation.
+  The band is the 95 % interval, for rows that hold the number of episodes. Draws
+  nothing if no row is an evaluation.
   """
   rows = [row for row in rows if row.get(SUCCESS) is not None]
   if not rows:
-    return False
+    return
   # Not pyplot, which would choose a display for the whole process.
   from matplotlib.backends.backend_agg import FigureCanvasAgg
   from matplotlib.figure import Figure
@@ -200,7 +198,6 @@ def plot_curve(rows: Sequence[Row], path: Path, *, title: str = "") -> bool:
   part = path.with_name(path.name + ".part")
   figure.savefig(part, dpi=120, format="png")
   part.replace(path)
-  return True
 
 
 def _interval(row: Row) -> tuple[float, float]:

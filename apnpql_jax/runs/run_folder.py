@@ -11,12 +11,12 @@ from pathlib import Path
 import shutil
 from typing import Any, NamedTuple
 
-from apnpql_jax.config import codec, files
+from apnpql_jax.config import files
 from apnpql_jax.config.checks import validate
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import ConfigError, FileError, UserError
+from apnpql_jax.runs.provenance import describe_versions
 from apnpql_jax.runs.text import read_text, write_text
-from apnpql_jax.runs.versions import describe_versions
 
 CONFIG_FILE = "config.json"
 """Its presence makes a folder a run folder."""
@@ -24,8 +24,8 @@ CONFIG_FILE = "config.json"
 _MAX_CONFIG_BYTES = 1 << 20
 
 MAY_CHANGE = (
-  "total_steps eval_every eval_episodes checkpoint_every keep_checkpoints "
-  "save_replay_every max_skipped_updates video sinks"
+  "total_steps eval_every eval_episodes eval_acting checkpoint_every "
+  "keep_checkpoints save_replay_every max_skipped_updates video sinks"
 ).split()
 """Settings that a resumed run may change, because they do not affect learning."""
 
@@ -89,7 +89,7 @@ def new_run_dir(preset: str, root: Path = Path("runs")) -> Path:
 
 
 def load_run_config(
-  run_dir: Path, warn: Callable[[str], None] = codec.ignore
+  run_dir: Path, warn: Callable[[str], None] | None = None
 ) -> TrainConfig:
   """Returns the configuration that a run was started with.
 
@@ -104,9 +104,13 @@ def load_run_config(
       f"{str(run_dir)!r} is not a run folder (no {CONFIG_FILE}); "
       f"{_nearby_runs(run_dir)}"
     )
+
+  def report(line: str) -> None:
+    if warn:
+      warn(f"{path} is {line}")
+
   try:
-    text = read_text(path, _MAX_CONFIG_BYTES)
-    return files.config_from_json(text, lambda line: warn(f"{path} is {line}"))
+    return files.config_from_json(read_text(path, _MAX_CONFIG_BYTES), report)
   except UserError as error:
     raise FileError(f"{path}: {error}") from None
   except (OSError, ValueError) as error:
@@ -172,7 +176,7 @@ def lock(run_dir: Path, *, shared: bool = False) -> Generator[None, None, None]:
       kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
       fcntl.flock(folder, kind | fcntl.LOCK_NB)
     except BlockingIOError:
-      raise FileError(f"{str(run_dir)!r} is trained by another process") from None
+      raise FileError(f"{str(run_dir)!r} is being trained by another process") from None
     except OSError:  # Some file systems have no locks.
       pass
     yield
@@ -200,7 +204,7 @@ def check_free(run_dir: Path, *, overwrite: bool) -> None:
     return
   if not (run_dir / CONFIG_FILE).is_file():
     raise FileError(
-      f"{str(run_dir)!r} holds something that is not a run; choose another --run"
+      f"{str(run_dir)!r} contains files that are not a run; choose another --run"
     )
   if not overwrite:
     raise FileError(

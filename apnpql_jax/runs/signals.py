@@ -22,7 +22,7 @@ _ONE_REQUEST_S = 1.0
 
 
 class Signals:
-  """Collects signals while it is entered; only the main thread may enter it.
+  """Context manager that records SIGINT and SIGTERM; enter it in the main thread.
 
   A signal ends the process at once, with a line and exit code ``INTERRUPTED`` plus its
   number, unless ``finish_first`` was called and it is the first.
@@ -34,7 +34,10 @@ class Signals:
     self._message, self._patient = message, False
 
   def finish_first(self, message: str) -> None:
-    """Only collects the first signal from now on; the second prints ``message``."""
+    """Lets the first signal only set ``caught``.
+
+    The second one prints ``message`` and ends the process.
+    """
     self._message, self._patient = message, True
 
   def __enter__(self) -> Signals:

@@ -21,10 +21,12 @@ class _TensorboardSink:
     self._writer = SummaryWriter(logdir=str(run_dir / "tensorboard"))
 
   def write(self, step: int, row: Mapping[str, float]) -> None:
+    """See ``Sink.write``."""
     for name, value in row.items():
       self._writer.add_scalar(name, value, step)
 
   def close(self) -> None:
+    """See ``Sink.close``."""
     self._writer.close()
 
 
@@ -39,9 +41,11 @@ class _WandbSink:
     )
 
   def write(self, step: int, row: Mapping[str, float]) -> None:
+    """See ``Sink.write``."""
     self._run.log(dict(row), step=step)
 
   def close(self) -> None:
+    """See ``Sink.close``."""
     self._run.finish()
 
 
@@ -56,7 +60,7 @@ def check_sinks(names: Sequence[str]) -> None:
   """Rejects sinks that cannot be opened.
 
   Raises:
-    ConfigError: a name is unknown, or its package is not installed.
+    ConfigError: A name is unknown, or its package is not installed.
   """
   for name in names:
     check_name("metric sink", name, list(_SINKS))

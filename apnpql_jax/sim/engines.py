@@ -16,7 +16,7 @@ def make_physics(name: str, scene: Scene, *, substeps: int) -> Physics:
   """Builds an engine; "auto" is C MuJoCo if JAX runs on the CPU, and MJX elsewhere.
 
   Raises:
-    ConfigError: unknown name.
+    ConfigError: The name is unknown.
   """
   check_name("backend", name, BACKENDS)
   if name == "auto":

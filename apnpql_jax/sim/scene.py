@@ -34,7 +34,6 @@ class Scene:
   gripper_qpos: int  # address of the driven finger joint in qpos
   gripper_dof: int  # the same in qvel
   tool_site: int  # id of the site between the closed finger tips
-  cameras: tuple[str, ...]  # names of all cameras
   variants: dict[str, np.ndarray]  # differing model fields, f32[variants, ...]
 
   def id(self, kind: str, name: str) -> int:
@@ -72,8 +71,8 @@ def load_scene(
   the parsed file, such as the shape of an object, but keep its structure.
 
   Raises:
-    ConfigError: the file does not compile, lacks a joint, site or camera, or
-      uses a feature that MJX would silently ignore.
+    ConfigError: The file does not compile, lacks a joint, site or camera, or uses a
+      feature that MJX would silently ignore.
   """
   models = [_compile(path, edit) for edit in variants or [lambda _: None]]
   model = models[0]
@@ -91,7 +90,6 @@ def load_scene(
     gripper_qpos=int(model.jnt_qposadr[finger]),
     gripper_dof=int(model.jnt_dofadr[finger]),
     tool_site=_named_id(model, path.stem, "site", TOOL_SITE),
-    cameras=tuple(model.camera(i).name for i in range(model.ncam)),
     variants=_differences(models),
   )
 

@@ -26,7 +26,7 @@ from apnpql_jax.sim import arm
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.tasks import geometry, pinch
-from apnpql_jax.tasks.base import FreeBody, TableTask, draw_pair
+from apnpql_jax.tasks.table_task import FreeBody, TableTask, draw_pair
 from apnpql_jax.tasks.task import ResetDraw, ToolTargets, register_task
 from apnpql_jax.types import Array
 
@@ -147,7 +147,7 @@ class FlipCup(TableTask):
     return self._placed(state) & self._cup.is_at_rest(state) & away
 
   def objects(self, state: PhysicsState) -> Array:
-    """Returns the cup's center, a point towards its mouth, the goal, and a corner."""
+    """Returns the cup's center, a point toward its mouth, the goal, and a corner."""
     cup, (width, height) = self._cup.pos(state), self._half_size(state)
     to_mouth = cup + geometry.POINTER * self._axis(state)
     corner = cup + jnp.stack([width, 0 * width, height], -1)

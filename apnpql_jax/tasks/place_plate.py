@@ -5,7 +5,7 @@ Primitives; following any one of them never knocks the plate over:
 
 - object: go above the plate, turn the fingers across it and, through a funnel, go down
   until its edge is between the open pads; stay there.
-- goal: with the plate in hand, lift it and, increasingly with height, move it towards
+- goal: with the plate in hand, lift it and, increasingly with height, move it toward
   the box; turn it across the box's longer side and, through a funnel, lower it to the
   floor. With empty hands, go above the box.
 - neutral: the configuration of the keyframe.
@@ -21,8 +21,8 @@ import numpy as np
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.tasks import geometry
-from apnpql_jax.tasks.base import FreeBody, TableTask, draw_pair, yaw_quat
 from apnpql_jax.tasks.pinch import ALIGNED, FUNNEL, Pinch, grip, pick_and_place
+from apnpql_jax.tasks.table_task import FreeBody, TableTask, draw_pair, yaw_quat
 from apnpql_jax.tasks.task import ResetDraw, ToolTargets, register_task
 from apnpql_jax.types import Array
 

@@ -19,8 +19,8 @@ import numpy as np
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.tasks import geometry
-from apnpql_jax.tasks.base import FreeBody, TableTask, draw_pair, yaw_quat
 from apnpql_jax.tasks.pinch import ALIGNED, FUNNEL, Pinch, grip, pick_and_place
+from apnpql_jax.tasks.table_task import FreeBody, TableTask, draw_pair, yaw_quat
 from apnpql_jax.tasks.task import ResetDraw, ToolTargets, register_task
 from apnpql_jax.types import Array
 

@@ -15,12 +15,12 @@ import numpy as np
 
 from apnpql_jax import devices
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config.checks import check_env
+from apnpql_jax.config.checks import ACTING, check_env
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.envs.env import Env, make_env
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs import checkpoint_reader, leaves, run_folder
-from apnpql_jax.runs.console import say
+from apnpql_jax.runs.console import print_line
 from apnpql_jax.runs.metrics import wilson_interval
 from apnpql_jax.training.rollout import (
   Episodes,
@@ -81,7 +81,7 @@ def evaluate(
   seed: int = 0,
   backend: str | None = None,
   step: int | None = None,
-  greedy: bool = False,
+  acting: str | None = None,
   video: Path | str | None = None,
 ) -> dict[str, Any]:
   """Plays held-out episodes with a checkpoint of a run.
@@ -92,7 +92,8 @@ def evaluate(
     seed: Random seed of bank rows and actions.
     backend: Physics engine; that of the run if None.
     step: Step of the checkpoint; the newest if None.
-    greedy: Take the candidate of highest value, or a parametric policy's mean.
+    acting: Rule that chooses actions, see ``agents/acting.py``; that of the run's
+      evaluations if None.
     video: File for a video of the first episodes; failures to write are only printed.
 
   Returns:
@@ -107,6 +108,8 @@ def evaluate(
   config = run_folder.open_run(run_dir).config
   env_config = dataclasses.replace(config.env, backend=backend or config.env.backend)
   check_env(env_config)
+  acting = acting or config.eval_acting
+  check_name("acting", acting, ACTING)
   checkpoint_reader.restore(run_dir, step, {}, config=config)  # Fails early.
   env = make_env(env_config, instants=config.agent.lstm_instants)
   agent = make_agent(config.agent)
@@ -117,11 +120,11 @@ def evaluate(
   devices.check_memory(leaves.nbytes(example), "the learner")
   found = checkpoint_reader.restore(run_dir, step, {"learner": example}, config=config)
   for line in found.damaged:
-    say(line)
+    print_line(line)
   learner = found.items["learner"]
-  play = make_player(env, lambda params: agent_policy(agent, params, greedy=greedy))
+  play = make_player(env, lambda params: agent_policy(agent, params, acting=acting))
   played = play_held_out(env, play, learner.target_params, episodes=episodes, seed=seed)
-  about = {"algorithm": config.agent.algorithm, "greedy": greedy}
+  about = {"algorithm": config.agent.algorithm, "acting": acting}
   return _summary(env, played, about, found.step, began, video)
 
 
@@ -182,6 +185,6 @@ def _summary(
     try:
       summary["video"] = str(record_episodes(env, played, video))
     except OSError as error:  # The episodes took minutes; keep their figures.
-      say(f"cannot write {video}: {error}")
+      print_line(f"cannot write {video}: {error}")
       summary["video"] = None
   return summary | {"checkpoint_step": step, "wall_s": time.monotonic() - began}

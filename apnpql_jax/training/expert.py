@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
 import numpy as np
 
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
@@ -22,27 +23,23 @@ from apnpql_jax.sim import physics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.training.placement import place
-from apnpql_jax.training.rollout import expert_policy, rollout
-from apnpql_jax.types import ACTION_DIM, Array, Slot
+from apnpql_jax.training.rollout import (
+  add_chunk,
+  example_slot,
+  expert_policy,
+  rollout,
+)
+from apnpql_jax.types import Array, Slot
 
-ExpertReplay = Callable[[TrainConfig, Env, Array], Replay | None]
+ExpertReplayMaker = Callable[[TrainConfig, Env, PRNGKeyArray], Replay | None]
+"""(settings, worlds, key) -> expert replay, or None if it has no slots."""
 
 CERTAIN = 100.0
 """Log density in nats of actions of an unknown policy: so high that Retrace cuts the
 trace."""
 
 
-def example_slot(worlds: EnvState) -> Slot:
-  """Returns the shapes and dtypes of a replay slot of one world."""
-  action: Any = jax.ShapeDtypeStruct((ACTION_DIM,), jnp.float32)
-  log_prob: Any = jax.ShapeDtypeStruct((), jnp.float32)
-  timestep = jax.tree.map(
-    lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), worlds.timestep
-  )
-  return Slot(timestep=timestep, action=action, log_prob=log_prob)
-
-
-def empty_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:
+def empty_expert(config: TrainConfig, env: Env, key: PRNGKeyArray) -> Replay | None:
   """Returns an empty expert replay, to get its shapes."""
   del key
   worlds, length = config.env.worlds, _length(config)
@@ -50,7 +47,7 @@ def empty_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:
   return replay.create(example_slot(state), length, worlds) if length else None
 
 
-def collect_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:
+def collect_expert(config: TrainConfig, env: Env, key: PRNGKeyArray) -> Replay | None:
   """Returns an expert replay of noisy episodes of the scripted expert."""
   worlds, length = config.env.worlds, _length(config)
   if not length:
@@ -60,22 +57,12 @@ def collect_expert(config: TrainConfig, env: Env, key: Array) -> Replay | None:
   rows = jax.random.randint(row_key, (worlds,), 0, env.bank_split)
 
   @jax.jit
-  def collect(state: EnvState, key: Array) -> Replay:
+  def collect(state: EnvState, key: PRNGKeyArray) -> Replay:
     after, chunk = rollout(env, policy, state, key, length=length)
     ring = replay.create(example_slot(state), length, worlds)
     return place(add_chunk(ring, state, after, chunk), env.mesh)
 
   return collect(env.reset(rows), play_key)
-
-
-def add_chunk(ring: Replay, before: EnvState, after: EnvState, chunk: Slot) -> Replay:
-  """Adds a chunk [time, worlds, ...] to a replay.
-
-  In worlds that became non-finite, excludes it and the episode before from sampling.
-  """
-  steps = before.elapsed + chunk.action.shape[0]
-  broken = after.faults > before.faults
-  return replay.exclude(replay.add(ring, chunk), jnp.where(broken, steps, 0))
 
 
 def replay_from_demonstrations(
@@ -137,8 +124,8 @@ def record_expert(
   rows = jax.random.randint(row_key, (episodes,), 0, env.bank_split)
 
   @jax.jit
-  def play(start: EnvState, key: Array):
-    def period(state: EnvState, key: Array):
+  def play(start: EnvState, key: PRNGKeyArray) -> Any:
+    def period(state: EnvState, key: PRNGKeyArray) -> tuple[EnvState, Any]:
       policy_key, env_key = jax.random.split(key)
       action, _ = policy(state, policy_key)
       after = env.step(state, action, env_key)
@@ -191,7 +178,7 @@ def _solve_targets(demos: Demonstrations, rows: np.ndarray, env: Env) -> np.ndar
   far = (residuals > [ik.POSITION_TOLERANCE, ik.ROTATION_TOLERANCE]).any((1, 2))
   if far.any():
     raise FileError(
-      f"demonstrations: the arm cannot reach a primitive's target at time step "
+      f"demonstrations: the arm cannot reach a primitive's target at instant "
       f"{unique[far.argmax()]}"
     )
   return targets.astype(np.float32)[inverse]

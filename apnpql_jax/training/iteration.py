@@ -9,18 +9,22 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import PRNGKeyArray
 
-from apnpql_jax.agents.learner import Agent
+from apnpql_jax.agents.learner import Agent, LearnerState
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.data import replay
+from apnpql_jax.data.replay import Replay
 from apnpql_jax.envs.env import Env
-from apnpql_jax.training.expert import add_chunk
 from apnpql_jax.training.placement import place
-from apnpql_jax.training.rollout import agent_policy, rollout
-from apnpql_jax.training.state import Faults, TrainState
-from apnpql_jax.types import Metrics, Transition
+from apnpql_jax.training.rollout import add_chunk, agent_policy, rollout
+from apnpql_jax.training.state import SkippedUpdates, TrainState
+from apnpql_jax.types import Array, Metrics, Transition
 
 Iteration = Callable[[TrainState], tuple[TrainState, Metrics]]
+
+Sample = Callable[..., Transition]
+"""(replay, expert replay, key) -> batch [B, ...] of an update."""
 
 
 def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
@@ -32,7 +36,7 @@ def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
 
   def iteration(state: TrainState) -> tuple[TrainState, Metrics]:
     key, rollout_key, update_key = jax.random.split(state.key, 3)
-    policy = agent_policy(agent, state.learner.target_params, greedy=False)
+    policy = agent_policy(agent, state.learner.target_params, acting="policy")
     worlds, chunk = rollout(
       env, policy, state.env, rollout_key, length=config.rollout_length
     )
@@ -65,8 +69,15 @@ def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
   return jax.jit(iteration, donate_argnums=0)
 
 
-def _update(agent, sample, ring, expert_replay, carry, key) -> Any:
-  """Runs one update inside ``scan``; skips and counts it if it is not finite."""
+def _update(
+  agent: Agent,
+  sample: Sample,
+  ring: Replay,
+  expert_replay: Replay | None,
+  carry: tuple[LearnerState, SkippedUpdates],
+  key: PRNGKeyArray,
+) -> tuple[tuple[LearnerState, SkippedUpdates], tuple[Metrics, Array]]:
+  """Runs one update inside ``scan``; skips and counts it if it is non-finite."""
   learner, faults = carry
   sample_key, learn_key = jax.random.split(key)
   batch = sample(ring, expert_replay, sample_key)
@@ -77,24 +88,22 @@ def _update(agent, sample, ring, expert_replay, carry, key) -> Any:
   leaves = jax.tree.leaves((batch, norms, updated.nu))
   ok = jnp.stack([jnp.isfinite(x).all() for x in leaves]).all()
   learner = jax.tree.map(functools.partial(jnp.where, ok), updated, learner)
-  faults = Faults(
+  faults = SkippedUpdates(
     in_a_row=jnp.where(ok, 0, faults.in_a_row + 1),
     key=jnp.where(ok, faults.key, key),
   )
   return (learner, faults), (metrics, ok)
 
 
-def make_sample(
-  config: TrainConfig, agent: Agent, mesh: Mesh | None = None
-) -> Callable[..., Transition]:
-  """Returns a function (replay, expert replay, key) -> batch [B, ...] of an update."""
+def make_sample(config: TrainConfig, agent: Agent, mesh: Mesh | None = None) -> Sample:
+  """Returns a function that draws the batch of an update."""
   draw = functools.partial(
     replay.sample_mixed,
     batch_size=config.replay.batch_size,
     expert_share=config.replay.expert_share,
     n_step=config.agent.n_step,
     gamma=config.agent.gamma,
-    windows=agent.evaluation.windows,
+    windows=agent.policy_evaluation.windows,
     instants=config.agent.lstm_instants,
   )
   if mesh is None:

@@ -24,7 +24,7 @@ EVAL_SEED = 1
 
 
 class Reporter:
-  """Writes and displays a run; only the first process has one."""
+  """Writer and display of a run; only the first process has one."""
 
   def __init__(
     self,
@@ -39,7 +39,7 @@ class Reporter:
     self._config, self._env, self._run_dir = config, env, run_dir
     self.writer, self._progress = writer, progress
     self._play = make_player(
-      env, lambda params: agent_policy(agent, params, greedy=False)
+      env, lambda params: agent_policy(agent, params, acting=config.eval_acting)
     )
     self._lap = time.monotonic()
     self.evaluation: dict[str, Any] = {}

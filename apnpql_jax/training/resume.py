@@ -44,7 +44,7 @@ def restore(
     warn(f"resuming from the checkpoint of step {found.step:,} instead")
   ring = found.items["replay"]["agent"]
   if found.steps["replay"] < found.step:
-    warn(f"its replay is that of step {found.steps['replay']:,}")
+    warn(f"its replay comes from step {found.steps['replay']:,}")
     # The next slots do not continue its newest ones.
     ring = replay.exclude(ring, jnp.ones(config.env.worlds, jnp.int32))
   return TrainState(

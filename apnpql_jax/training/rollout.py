@@ -1,4 +1,4 @@
-"""Rollouts of policies: loops over time, batched over worlds."""
+"""Rollouts of policies: loops over time, batched over worlds, into the replay."""
 
 from __future__ import annotations
 
@@ -8,15 +8,18 @@ from typing import Any
 from flax import struct
 import jax
 import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
 
-from apnpql_jax.agents.heads import Params
 from apnpql_jax.agents.learner import Agent
+from apnpql_jax.agents.networks import Params
+from apnpql_jax.data import replay
+from apnpql_jax.data.replay import Replay
 from apnpql_jax.envs.env import Env
 from apnpql_jax.envs.state import EnvState
 from apnpql_jax.sim.physics import PhysicsState
-from apnpql_jax.types import ARM_DOF, Array, Slot
+from apnpql_jax.types import ACTION_DIM, ARM_DOF, Array, Slot
 
-Policy = Callable[[EnvState, Array], tuple[Array, Array]]
+WorldPolicy = Callable[[EnvState, PRNGKeyArray], tuple[Array, Array]]
 """(worlds, key) -> actions f32[worlds, 7], log densities f32[worlds]."""
 
 FILMED = 4
@@ -26,23 +29,26 @@ _LEAST_NOISE = 1e-6
 """Standard deviation in rad/s for zero noise; denser than any policy."""
 
 
-def agent_policy(agent: Agent, params: Params, *, greedy: bool) -> Policy:
-  """Returns the learned policy, which depends on observations only."""
+def agent_policy(agent: Agent, params: Params, *, acting: str) -> WorldPolicy:
+  """Returns the learned policy, which depends on observations only.
 
-  def policy(state: EnvState, key: Array) -> tuple[Array, Array]:
-    action, info = agent.act(params, state.observation, key, greedy=greedy)
+  ``acting`` is a rule of ``agents/acting.py``.
+  """
+
+  def policy(state: EnvState, key: PRNGKeyArray) -> tuple[Array, Array]:
+    action, info = agent.act(params, state.observation, key, acting=acting)
     return action, info["log_prob"]
 
   return policy
 
 
-def expert_policy(env: Env, *, noise: float) -> Policy:
+def expert_policy(env: Env, *, noise: float) -> WorldPolicy:
   """Returns the task's scripted expert with Gaussian noise on its joint velocities.
 
   ``noise`` is its standard deviation in rad/s.
   """
 
-  def policy(state: EnvState, key: Array) -> tuple[Array, Array]:
+  def policy(state: EnvState, key: PRNGKeyArray) -> tuple[Array, Array]:
     action = env.expert_action(state)
     mean = action[..., :ARM_DOF]
     velocity = (mean + noise * jax.random.normal(key, mean.shape)).clip(-1.0, 1.0)
@@ -56,7 +62,7 @@ def expert_policy(env: Env, *, noise: float) -> Policy:
 
 
 def rollout(
-  env: Env, policy: Policy, state: EnvState, key: Array, *, length: int
+  env: Env, policy: WorldPolicy, state: EnvState, key: PRNGKeyArray, *, length: int
 ) -> tuple[EnvState, Slot]:
   """Plays ``length`` control periods in every world, episode after episode.
 
@@ -64,7 +70,7 @@ def rollout(
     The worlds afterwards, and the slots with leaves [length, worlds, ...].
   """
 
-  def period(state: EnvState, key: Array) -> tuple[EnvState, Slot]:
+  def period(state: EnvState, key: PRNGKeyArray) -> tuple[EnvState, Slot]:
     policy_key, env_key = jax.random.split(key)
     action, log_prob = policy(state, policy_key)
     slot = Slot(timestep=state.timestep, action=action, log_prob=log_prob)
@@ -73,26 +79,46 @@ def rollout(
   return jax.lax.scan(period, state, jax.random.split(key, length))
 
 
+def example_slot(worlds: EnvState) -> Slot:
+  """Returns the shapes and dtypes of a replay slot of one world."""
+  action: Any = jax.ShapeDtypeStruct((ACTION_DIM,), jnp.float32)
+  log_prob: Any = jax.ShapeDtypeStruct((), jnp.float32)
+  timestep = jax.tree.map(
+    lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), worlds.timestep
+  )
+  return Slot(timestep=timestep, action=action, log_prob=log_prob)
+
+
+def add_chunk(ring: Replay, before: EnvState, after: EnvState, chunk: Slot) -> Replay:
+  """Adds a chunk [time, worlds, ...] to a replay.
+
+  In worlds that became non-finite, excludes it and the episode before from sampling.
+  """
+  steps = before.elapsed + chunk.action.shape[0]
+  broken = after.faults > before.faults
+  return replay.exclude(replay.add(ring, chunk), jnp.where(broken, steps, 0))
+
+
 class Episodes(struct.PyTreeNode):
   """One episode per world."""
 
   success: Array  # bool[worlds]
   length: Array  # i32[worlds]: control periods until success or time-out
-  states: PhysicsState  # [time, <= FILMED, ...]: time steps 0 to ``length``
+  states: PhysicsState  # [time, <= FILMED, ...]: instants 0 to ``length``
 
 
-Player = Callable[[Any, Array, Array], Episodes]
+Player = Callable[[Any, Array, PRNGKeyArray], Episodes]
 """(parameters of the policy, bank rows i32[worlds], key) -> episodes."""
 
 
-def make_player(env: Env, make_policy: Callable[[Any], Policy]) -> Player:
+def make_player(env: Env, make_policy: Callable[[Any], WorldPolicy]) -> Player:
   """Returns a jitted function that plays one episode per row until all are over.
 
   A world that becomes non-finite counts as failed.
   """
 
   @jax.jit
-  def play(params: Any, rows: Array, key: Array) -> Episodes:
+  def play(params: Any, rows: Array, key: PRNGKeyArray) -> Episodes:
     policy = make_policy(params)
 
     def step(carry):

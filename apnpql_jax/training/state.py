@@ -5,6 +5,7 @@ from __future__ import annotations
 from flax import struct
 import jax
 import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
 
 from apnpql_jax.agents.learner import Agent, LearnerState
 from apnpql_jax.config.schema import TrainConfig
@@ -12,16 +13,17 @@ from apnpql_jax.data import replay
 from apnpql_jax.data.replay import Replay
 from apnpql_jax.envs.env import Env
 from apnpql_jax.envs.state import EnvState
-from apnpql_jax.training.expert import ExpertReplay, empty_expert, example_slot
+from apnpql_jax.training.expert import ExpertReplayMaker, empty_expert
 from apnpql_jax.training.placement import place, shardings
+from apnpql_jax.training.rollout import example_slot
 from apnpql_jax.types import Array
 
 
-class Faults(struct.PyTreeNode):
-  """Updates skipped because they were not finite."""
+class SkippedUpdates(struct.PyTreeNode):
+  """Record of the non-finite updates, which are skipped."""
 
   in_a_row: Array  # i32[]: consecutive ones, up to now
-  key: Array  # typed PRNG key of the last one, to repeat it
+  key: PRNGKeyArray  # typed PRNG key of the last one, to repeat it
 
 
 class TrainState(struct.PyTreeNode):
@@ -31,13 +33,13 @@ class TrainState(struct.PyTreeNode):
   env: EnvState  # [worlds, ...]
   replay: Replay
   expert_replay: Replay | None
-  key: Array  # typed PRNG key
+  key: PRNGKeyArray  # typed PRNG key
   env_steps: Array  # i32[]: environment steps done, summed over worlds
-  faults: Faults
+  faults: SkippedUpdates
 
 
 def initial_state(
-  config: TrainConfig, env: Env, agent: Agent, expert: ExpertReplay
+  config: TrainConfig, env: Env, agent: Agent, expert: ExpertReplayMaker
 ) -> TrainState:
   """Returns the state of a new run; ``expert`` makes the expert replay."""
   keys = jax.random.split(jax.random.key(config.seed), 5)
@@ -46,7 +48,7 @@ def initial_state(
 
   @jax.jit
   def start(
-    worlds: EnvState, key: Array, init_key: Array, fault_key: Array
+    worlds: EnvState, key: PRNGKeyArray, init_key: PRNGKeyArray, fault_key: PRNGKeyArray
   ) -> TrainState:
     length = config.replay.capacity // config.env.worlds
     state = TrainState(
@@ -56,7 +58,7 @@ def initial_state(
       expert_replay=None,
       key=key,
       env_steps=jnp.zeros((), jnp.int32),
-      faults=Faults(in_a_row=jnp.zeros((), jnp.int32), key=fault_key),
+      faults=SkippedUpdates(in_a_row=jnp.zeros((), jnp.int32), key=fault_key),
     )
     return place(state, env.mesh)
 

@@ -22,16 +22,16 @@ from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.data import demonstrations, replay
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.errors import ConfigError, RunStopped
-from apnpql_jax.runs import checkpoint_reader, leaves, run_folder, versions
+from apnpql_jax.runs import checkpoint_reader, leaves, provenance, run_folder
 from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
-from apnpql_jax.runs.console import say
+from apnpql_jax.runs.console import print_line
 from apnpql_jax.runs.metrics import MetricWriter
 from apnpql_jax.runs.progress import TrainProgress
 from apnpql_jax.runs.signals import Signals
 from apnpql_jax.runs.sinks import check_sinks, make_sinks
 from apnpql_jax.tasks import make_task, task_names
-from apnpql_jax.training import expert, faults
-from apnpql_jax.training.expert import ExpertReplay, collect_expert
+from apnpql_jax.training import expert, skipped_updates
+from apnpql_jax.training.expert import ExpertReplayMaker, collect_expert
 from apnpql_jax.training.iteration import make_iteration
 from apnpql_jax.training.reporter import Reporter
 from apnpql_jax.training.resume import restore, set_aside, to_items
@@ -98,7 +98,7 @@ def train(
   )
   with signals if handle_signals else contextlib.nullcontext():
     start = _start(config, run_dir, mesh, resume=resume, overwrite=overwrite)
-    _say(f"run folder {start.path}; compiling, which can take minutes")
+    _print_line(f"run folder {start.path}; compiling, which can take minutes")
     try:
       state, evaluation = _run(config, start, signals)
     except OSError as error:  # The disk is full or gone.
@@ -127,7 +127,7 @@ def _run(
     if devices.is_primary():
       stack.enter_context(run_folder.lock(path))
       if resume_step is not None and (aside := set_aside(path, resume_step)):
-        say(f"later checkpoints and a copy of the metrics were moved to {aside}")
+        print_line(f"later checkpoints and a copy of the metrics were moved to {aside}")
     devices.barrier()
     if devices.is_primary():
       sinks = make_sinks(config.sinks, path, dict(codec.flatten(config)))
@@ -163,8 +163,8 @@ def _start(
   count = mesh.size if mesh else 1
   if resume:
     path = run_folder.open_run(run_dir).path
-    for change in versions.changed_versions(path, devices=count):
-      _say(f"changed since the run began: {change}")
+    for change in provenance.changed_versions(path, devices=count):
+      _print_line(f"changed since the run began: {change}")
   saved = resume and checkpoint_reader.latest_step(run_dir) is not None
   if saved:
     checkpoint_reader.restore(run_dir, None, {}, config=config)  # Fails early.
@@ -174,15 +174,15 @@ def _start(
   example = example_state(config, env, agent)
   devices.check_memory(leaves.nbytes(example), "the training state")
   if fill is None:
-    state = restore(config, run_dir, example, _say)
+    state = restore(config, run_dir, example, _print_line)
     return Start(env, agent, path, state, int(state.env_steps))
-  _say("filling the expert replay")
+  _print_line("filling the expert replay")
   state = initial_state(config, env, agent, fill)
   if state.expert_replay is not None:
     solved, ended = map(int, replay.episodes(state.expert_replay))
-    _say(f"expert replay: {solved} of {ended} episodes solved")
+    _print_line(f"expert replay: {solved} of {ended} episodes solved")
   if resume:
-    _say("the run has no checkpoint yet and starts from the beginning")
+    _print_line("the run has no checkpoint yet and starts from the beginning")
     return Start(env, agent, path, state, 0)
   devices.run_on_primary(
     lambda: run_folder.create(run_dir, config, overwrite=overwrite, devices=count)
@@ -190,13 +190,14 @@ def _start(
   return Start(env, agent, run_folder.open_run(run_dir).path, state, None)
 
 
-def _expert(config: TrainConfig) -> ExpertReplay:
+def _expert(config: TrainConfig) -> ExpertReplayMaker:
   """Returns how to fill the expert replay; reads the demonstrations, if any."""
   if not config.replay.demonstrations:
     return collect_expert
   path, task = Path(config.replay.demonstrations), make_task(config.env.task)
   demos = demonstrations.load(path, task, config.env.control_period_s)
-  _say(f"{demos.instants} time steps of {path} for {config.replay.expert_steps} slots")
+  slots = config.replay.expert_steps
+  _print_line(f"expert replay: {demos.instants} instants of {path} fill {slots} slots")
   return lambda config, env, _: expert.replay_from_demonstrations(demos, config, env)
 
 
@@ -213,7 +214,7 @@ def _loop(config, start, iteration, reporter, saver, signals) -> TrainState:
     metrics |= saver.finished()
     if reporter:
       reporter.iteration(step, int(state.learner.step), metrics)
-    faults.check(config, state, start.path)
+    skipped_updates.check(config, state, start.path)
     done = step >= config.total_steps
     rate = None
     # Check for signals first, so that saving does not wait for an evaluation.
@@ -229,9 +230,9 @@ def _loop(config, start, iteration, reporter, saver, signals) -> TrainState:
   return state
 
 
-def _say(text: str) -> None:
+def _print_line(line: str) -> None:
   if devices.is_primary():
-    say(text)
+    print_line(line)
 
 
 def _passed(before: int, now: int, every: int) -> bool:

@@ -44,7 +44,7 @@ def record_episodes(env: Env, played: Episodes, path: Path) -> Path:
 def film(env: Env, played: Episodes) -> list[np.ndarray]:
   """Renders the first episodes, u8[T, H, W, 3] each.
 
-  The last time step gets a green border if the task was solved, else a red one.
+  The last instant gets a green border if the task was solved, else a red one.
   """
   sizes = (
     ("wide", VIEW_SIZE),
@@ -55,7 +55,7 @@ def film(env: Env, played: Episodes) -> list[np.ndarray]:
   draw = jax.jit(lambda physics: [env.view(camera, physics) for camera in cameras])
   episodes = []
   for episode in range(played.states.time.shape[1]):
-    # Draw later time steps too, although never reached, so that one program suffices.
+    # Draw the unused instants after the end too, so that one program suffices.
     instants = int(played.length[episode]) + 1
     physics = jax.tree.map(lambda x: x[:, episode], played.states)  # noqa: B023
     frames = tile([np.asarray(view)[:instants] for view in draw(physics)])

@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
 import mujoco
 
 from apnpql_jax.agents.learner import Agent
@@ -31,13 +32,13 @@ PLAYED = 5  # rollouts before anything is timed: nothing moves yet at the reset
 Part = tuple[float, float]  # seconds and floor of a part, for all worlds
 
 
-def random_policy(state: EnvState, key: Array) -> tuple[Array, Array]:
-  """Draws random actions; a ``rollout.Policy``."""
+def random_policy(state: EnvState, key: PRNGKeyArray) -> tuple[Array, Array]:
+  """Draws random actions; a ``rollout.WorldPolicy``."""
   worlds = state.elapsed.shape[0]
   return random_actions(key, worlds), jnp.zeros(worlds)
 
 
-def random_actions(key: Array, worlds: int) -> Array:
+def random_actions(key: PRNGKeyArray, worlds: int) -> Array:
   """Draws f32[worlds, 7], uniform over the action box."""
   arm_key, grip_key = jax.random.split(key)
   velocity = jax.random.uniform(arm_key, (worlds, ARM_DOF), minval=-1.0, maxval=1.0)
@@ -62,8 +63,8 @@ def prepare(
     images = functools.partial(draw, env, env.config)
     found["rendering"] = _ready(images, (state.physics,))
 
-  def act(params: Any, state: EnvState, key: Array) -> tuple[Array, Array]:
-    return agent_policy(agent, params, greedy=False)(state, key)
+  def act(params: Any, state: EnvState, key: PRNGKeyArray) -> tuple[Array, Array]:
+    return agent_policy(agent, params, acting="policy")(state, key)
 
   return found | {"networks": _ready(act, (params, state, jax.random.key(0)))}
 

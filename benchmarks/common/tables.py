@@ -22,7 +22,7 @@ def put(name: str, text: str, doc: Path) -> None:
   """Replaces the block of a document between the marks of that name.
 
   Raises:
-    ValueError: the document lacks the marks.
+    ValueError: The document lacks the marks.
   """
   begin, end = f"<!-- {name} -->", f"<!-- end {name} -->"
   before, found, rest = doc.read_text().partition(begin)

@@ -86,7 +86,7 @@ def compiled(jitted: Any, *args: Any, options: Any = None) -> tuple[Any, float]:
     the program and the seconds of its compilation.
 
   Raises:
-    ConfigError: the program needs more memory than there is.
+    ConfigError: The program needs more memory than there is.
   """
   with turns.turn(shared=True):
     began = time.perf_counter()

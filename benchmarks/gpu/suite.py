@@ -7,7 +7,7 @@
 Runs a short training from pixels and then the ordinary benchmarks, in the order of
 ``SECTIONS``. Several compile at the same time, but only one measures, while nobody
 compiles. The file is complete after every result. A section that fails or exceeds the
-budget keeps its earlier results, and its status says why it ended.
+budget keeps its earlier results, and its status holds the reason.
 """
 
 from collections.abc import Sequence

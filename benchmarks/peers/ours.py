@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
 
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config.files import load_preset
@@ -40,15 +41,15 @@ def worlds(settings: sides.Settings) -> dict[str, sides.Measure]:
   start = env.reset(jnp.arange(config.worlds) % env.bank_split)
 
   @jax.jit
-  def whole(state: EnvState, key: Array) -> EnvState:
+  def whole(state: EnvState, key: PRNGKeyArray) -> EnvState:
     return rollout(env, parts.random_policy, state, key, length=periods)[0]
 
-  def period(state: Any, key: Array) -> tuple[Any, None]:
+  def period(state: Any, key: PRNGKeyArray) -> tuple[Any, None]:
     action = parts.random_actions(key, config.worlds)
     return env.physics.step(state, action[:, :6], action[:, 6]), None
 
   @jax.jit
-  def physics(state: Any, key: Array) -> Any:
+  def physics(state: Any, key: PRNGKeyArray) -> Any:
     stock = patched(barrier=False, cones=False)
     with stock if settings["stock"] else contextlib.nullcontext():
       return jax.lax.scan(period, state, jax.random.split(key, periods))[0]

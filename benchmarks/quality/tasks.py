@@ -32,8 +32,7 @@ RESULTS = store.RESULTS / "tasks"
 DOC = store.ROOT / "docs" / "tasks.md"
 INSTANTS, MARGIN = 4, 6
 """Instants of an episode in a picture, and white pixels around each."""
-EXPERTS = "task|backend|solved|rate (95 %)|periods|pairs|contact slots|rows"
-EXPERTS += "|physics steps/s"
+EXPERTS = "task|backend|solved|rate (95 %)|periods"
 BANKS = "bank of resets|rows|draws rejected|residual of mink|built in|loaded in"
 
 
@@ -96,16 +95,13 @@ def write_tables(doc: Path = DOC) -> None:
 
 
 def expert_row(result: dict) -> list[object]:
-  """Returns the expert's success and the cost of the scene on one engine."""
-  backend, contacts = result["backend"], result["contacts"]
+  """Returns the expert's success on one engine."""
   rate, low, high = (100 * x for x in (result["success_rate"], *result["ci95"]))
   return [
-    *(result["task"], backend),
+    *(result["task"], result["backend"]),
     f"{result['successes']} of {result['episodes']}",
     f"{rate:.1f} % ({low:.1f} to {high:.1f})",
     result["mean_length"],
-    *(contacts[key] for key in ("pairs", "contacts", "constraint_rows")),
-    contacts[f"{backend}_steps_per_s"],
   ]
 
 

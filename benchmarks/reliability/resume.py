@@ -48,7 +48,7 @@ def main() -> int:
 def train(run: Path, *args: str) -> None:
   """Trains to the end in a new process; raises its output if it fails."""
   output = run.parent / "output"
-  if testing.start(run, *args, said=output, xla_flags="").wait():
+  if testing.start(run, *args, log=output, xla_flags="").wait():
     raise RuntimeError(output.read_text()[-2000:])
 
 
@@ -56,7 +56,7 @@ def compare(a: Arrays, b: Arrays) -> dict[str, Any]:
   """Counts the arrays of equal bits and measures the largest relative difference.
 
   Raises:
-    ValueError: the states have different arrays.
+    ValueError: The states have different arrays.
   """
   if a.keys() != b.keys():
     raise ValueError(f"only one state has {sorted(a.keys() ^ b.keys())}")

@@ -5,7 +5,7 @@
 Two runs of one seed train side by side. One is undisturbed, and its memory is measured.
 The other meets a fault every few seconds and is resumed. At the end a third run trains
 straight to the step of the disturbed one. All their arrays must be the same bits, and
-the metrics of all three the same numbers. Worlds and rewards that are not finite are
+the metrics of all three the same numbers. Non-finite worlds and rewards are
 put into checkpoints of copies of the disturbed run. Writes results/soak.json and
 results/soak.log.
 """
@@ -60,7 +60,7 @@ class Trial:
   def start(self, run: Path, *args: str) -> Process:
     """Trains in a new process, whose output replaces that of the previous one."""
     self._output.write_text("")
-    return testing.start(run, *OPTIONS, *(args or ENDLESS), said=self._output)
+    return testing.start(run, *OPTIONS, *(args or ENDLESS), log=self._output)
 
   def disturb(self, fault: str) -> Row:
     """Trains for some seconds, causes a fault, and returns its consequences."""

@@ -86,7 +86,8 @@ def training(args: list[str], run: Path, **env: str) -> Generator[float]:
     seconds from the command to the first row of metrics.
 
   Raises:
-    RuntimeError: the process ended early, or took too long; with its last output.
+    RuntimeError: The process ended early or took too long; the message holds its last
+      output.
   """
   command = [sys.executable, "-m", "apnpql_jax", "train", *args, "--run", str(run)]
   output, began = run.with_suffix(".txt"), time.monotonic()

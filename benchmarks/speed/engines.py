@@ -81,7 +81,7 @@ def prepare(
 ) -> timing.Ready:
   """Compiles a period of all worlds, from rest at ``start`` to the final qpos.
 
-  ``limited`` says whether the scene's limit on contacts applies; see also ``patched``.
+  ``limited`` is whether the scene's limit on contacts applies; see also ``patched``.
   """
   all_contacts = make_task(TASK).scene.model
   all_contacts.numeric("max_contact_points").data[:] = -1

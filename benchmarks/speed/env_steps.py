@@ -18,7 +18,7 @@ from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.envs.state import EnvState
-from apnpql_jax.training.rollout import Policy, agent_policy, rollout
+from apnpql_jax.training.rollout import WorldPolicy, agent_policy, rollout
 from benchmarks.common import command, parts, settings, timing
 
 
@@ -36,9 +36,9 @@ def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
   worlds, length = config.env.worlds, config.rollout_length
   state = env.reset(jnp.arange(worlds) % env.bank_split)
   params = jax.jit(agent.init)(jax.random.key(0), state.observation).params
-  policies: dict[str, Callable[[Any], Policy]] = {
+  policies: dict[str, Callable[[Any], WorldPolicy]] = {
     "env": lambda params: parts.random_policy,
-    "env_policy": functools.partial(agent_policy, agent, greedy=False),
+    "env_policy": functools.partial(agent_policy, agent, acting="policy"),
   }
   players = {}
   for name, policy in policies.items():
@@ -66,7 +66,7 @@ def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
 
 def player(
   env: Env,
-  policy: Callable[[Any], Policy],
+  policy: Callable[[Any], WorldPolicy],
   params: Any,
   state: EnvState,
   *,

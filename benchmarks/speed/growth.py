@@ -33,7 +33,7 @@ from apnpql_jax.sim.engines import make_physics
 from apnpql_jax.sim.physics import initial_state
 from apnpql_jax.sim.scene import Scene, load_scene
 from apnpql_jax.tasks import make_task
-from apnpql_jax.training.expert import example_slot
+from apnpql_jax.training.rollout import example_slot
 from benchmarks.common import command, floor, noise, parts, settings, timing
 from benchmarks.speed import env_steps, learner
 
@@ -80,20 +80,20 @@ def measure_all(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def worlds(config: TrainConfig, args: argparse.Namespace) -> Sizes:
-  """One control period with images and random actions."""
+  """Yields one control period with images and random actions."""
   for backend, count in itertools.product(args.backends, args.worlds):
     chosen = settings.changed(config, "env", backend=backend, worlds=count)
     yield backend, count, _period, chosen.env
 
 
 def candidates(config: TrainConfig, args: argparse.Namespace) -> Sizes:
-  """One update."""
+  """Yields one update."""
   for count in args.candidates:
     yield "update", count, _update, settings.with_candidates(config, count)
 
 
 def pixels(config: TrainConfig, args: argparse.Namespace) -> Sizes:
-  """The images of all worlds, and one update with such images."""
+  """Yields the images of all worlds, and one update with such images."""
   for scale in args.scales:
     names = ("global_size", "wrist_size")
     sides = {k: tuple(round(scale * x) for x in getattr(config.env, k)) for k in names}
@@ -104,13 +104,13 @@ def pixels(config: TrainConfig, args: argparse.Namespace) -> Sizes:
 
 
 def slots(config: TrainConfig, args: argparse.Namespace) -> Sizes:
-  """Adding a rollout, excluding what a broken world leaves, and drawing a batch."""
+  """Yields the storage of a rollout with a broken world, and the draw of a batch."""
   for count in args.slots:
     yield "add and draw", count, _replay, config, count
 
 
 def contacts(config: TrainConfig, args: argparse.Namespace) -> Sizes:
-  """The physics of one control period of place_plate."""
+  """Yields the physics of one control period of place_plate."""
   del config
   for count in args.pairs:
     keep = functools.partial(_keep_pairs, count)

@@ -21,9 +21,8 @@ import jax
 import jax.numpy as jnp
 
 from apnpql_jax.agents import learner
-from apnpql_jax.agents.heads import Heads, Networks, Params
 from apnpql_jax.agents.learner import Agent, make_agent
-from apnpql_jax.agents.networks import make_networks
+from apnpql_jax.agents.networks import Heads, Networks, Params, make_networks
 from apnpql_jax.config.schema import AgentConfig, TrainConfig
 from apnpql_jax.types import Array, Observation, Transition
 from benchmarks.common import command, floor, noise, settings, timing

@@ -1,11 +1,12 @@
-"""One state, two equally good actions: what each policy keeps of them.
+"""One state with two equally good actions: which of them each policy keeps.
 
   python experiments/results/bimodal_bandit.py
 
-Writes bimodal_bandit.png beside this file. Reward is 1 where the first two joints move
-together at 0.6 rad/s, one way or the other, and falls off around. Three algorithms see
-the same uniformly random actions and share prior, limit and value network. The prior is
-held still, so that they differ in the policy alone, as in Table I of the paper.
+Writes bimodal_bandit.png next to this file. The reward is 1 where the first two joints
+move together at 0.6 rad/s in either direction, and falls off around these two peaks.
+Three algorithms learn from the same uniformly random actions, with the same KL limit
+and networks. The prior is not trained, so that they differ only in the policy, as in
+Table I of the paper.
 """
 
 from __future__ import annotations
@@ -15,20 +16,20 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
 import numpy as np
 
-from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.config.schema import AgentConfig
+from apnpql_jax import AgentConfig, configure, make_agent
 from apnpql_jax.types import Array, Observation, Transition
 
 PEAKS = ((0.6, 0.6), (-0.6, -0.6))
-"""Velocities of the first two joints, rad/s; the other joints do not matter."""
+"""Velocities of the first two joints, rad/s; the reward ignores the other joints."""
 
 WIDTH = 0.2
 """Distance in rad/s at which the reward has fallen to exp(-1/2)."""
 
 PRIMITIVES = ((0.4, 0.4), (-0.4, -0.4), (0.0, 0.0))
-"""Labels of the action primitives: the right ways, but not the right speed."""
+"""Labels of the action primitives: the right directions at too low a speed."""
 
 ALGORITHMS = ("ap_npql", "ap_mpo", "ap_sac")
 BATCH = 64
@@ -47,24 +48,24 @@ CONFIG = AgentConfig(
 
 
 def reward(actions: Array | np.ndarray) -> Array:
-  """f32[*b, 7] -> f32[*b] within [0, 1]."""
+  """Returns the rewards f32[*b] in [0, 1] of actions f32[*b, 7]."""
   distance = jnp.square(actions[..., None, :2] - jnp.array(PEAKS)).sum(-1)
   return jnp.exp(-0.5 * distance / WIDTH**2).max(-1)
 
 
 def nearest(actions: np.ndarray) -> np.ndarray:
-  """Index of the peak whose basin (within two widths) holds each action, else -1."""
+  """Returns the index of the peak within two widths of each action, or -1."""
   distance = np.linalg.norm(actions[:, None, :2] - np.array(PEAKS), axis=-1)
   return np.where(distance.min(1) < 2.0 * WIDTH, distance.argmin(1), -1)
 
 
 def observation(batch: int) -> Observation:
-  """The only state there is."""
+  """Returns a batch of the only state."""
   return Observation(robot=jnp.zeros((batch, 21)))
 
 
-def transitions(key: Array) -> Transition:
-  """Uniformly random actions and their rewards; every episode ends at once."""
+def transitions(key: PRNGKeyArray) -> Transition:
+  """Draws uniformly random actions with their rewards; every episode ends at once."""
   arm, gripper = jax.random.split(key)
   actions = jnp.concatenate(
     [
@@ -86,7 +87,7 @@ def transitions(key: Array) -> Transition:
 
 
 def play(config: AgentConfig, *, updates: int, draws: int, seed: int = 0) -> np.ndarray:
-  """Trains on ``updates`` batches, then acts: f32[draws, 7]."""
+  """Trains on ``updates`` batches, then draws actions f32[draws, 7]."""
   agent = make_agent(config)
   key_init, key_train, key_act = jax.random.split(jax.random.key(seed), 3)
 
@@ -103,7 +104,7 @@ def play(config: AgentConfig, *, updates: int, draws: int, seed: int = 0) -> np.
 
 
 def draw(actions: dict[str, np.ndarray], path: Path) -> None:
-  """The actions of each algorithm over the reward."""
+  """Plots the actions of each algorithm over the reward."""
   import matplotlib
 
   matplotlib.use("Agg")
@@ -130,7 +131,8 @@ def draw(actions: dict[str, np.ndarray], path: Path) -> None:
 
 
 def main() -> None:
-  """Trains the three and draws what they do."""
+  """Trains the three algorithms and plots their actions."""
+  configure()
   actions = {
     name: play(dataclasses.replace(CONFIG, algorithm=name), updates=2000, draws=1000)
     for name in ALGORITHMS

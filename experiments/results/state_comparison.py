@@ -5,10 +5,10 @@
   python experiments/results/state_comparison.py --tasks push_plate --seeds 0 \
       --rows npql_without_ap sac_without_ap
 
-Trains whatever is missing in state_comparison/ beside this file, a JSON per run, the
-rows of the paper with equal budgets of environment steps, updates and candidates; then
-draws curves.png and writes table.md from all that is there. A run can be interrupted;
-it then starts over.
+Trains the runs whose JSON files are missing in state_comparison/ next to this file.
+The rows of the paper have equal budgets of environment steps, updates and candidates.
+Then plots curves.png and writes table.md from all files there. A run that is
+interrupted starts over.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ OUT = Path(__file__).resolve().with_suffix("")
 
 
 class Row(NamedTuple):
-  """What is compared."""
+  """An algorithm with its settings."""
 
   algorithm: str
   flags: str = ""
-  """In which it differs from the preset of the task."""
+  """Options that change the preset of the task."""
 
   budget: int = 1
-  """Times the environment steps of the others."""
+  """Factor on the environment steps of the other rows."""
 
 
 # Parametric policies start as narrow as the prior is at its widest.
@@ -65,14 +65,14 @@ SAC = "--agent.epsilon 10 --agent.min-alpha 0.001"
 ROWS = {
   "ap_npql": Row("ap_npql"),
   "ap_mpo": Row("ap_mpo", NARROW),
-  # At the presets' floor on alpha pi stays with the primitive it began with; and it
-  # begins hundreds of nats from the prior, where a limit that binds drives alpha to
-  # 1,000, and half of the budget goes by until it is back.
+  # With the presets' floor on alpha, pi never leaves the primitive that it starts at.
+  # It starts hundreds of nats from the prior. A limit that binds there would drive
+  # alpha to 1,000, and half of the budget would pass before it falls again.
   "ap_sac": Row("ap_sac", f"{NARROW} --agent.epsilon 50 --agent.min-alpha 0.001"),
-  # A uniform prior: 4.85 - epsilon is the floor on the policy's entropy, and at the
-  # presets' floor on alpha a nat of it is worth a period of discount.
+  # With the uniform prior, 4.85 - epsilon is the floor on the policy's entropy. With
+  # the presets' floor on alpha, a nat is worth the discount of one control period.
   "sac": Row("sac", SAC),
-  # Nothing of the primitives, neither as means of the prior nor as an auxiliary loss.
+  # Without primitives, both as means of the prior and as an auxiliary loss.
   "npql_without_ap": Row(
     "ap_npql",
     "--agent.prior-mean learned --agent.min-std 0.05 --agent.initial-std 0.2 "
@@ -86,30 +86,30 @@ PAPER = ("ap_npql", "ap_mpo", "ap_sac", "sac")
 TASKS = ("push_plate", "stack_box", "flip_cup", "place_plate")
 
 STEPS = 30_720
-"""Environment steps per run; four of them for each update."""
+"""Environment steps per run; four per update."""
 
 EVALUATIONS = 12
-"""Per run: what decides how finely "steps to 80 %" is known."""
+"""Evaluations per run, which set the resolution of "steps to 80 %"."""
 
 CANDIDATES = 40
-"""For each estimate, where the paper has 120 and 100, for the hours that it takes."""
+"""Candidates per estimate, fewer than the 120 and 100 of the paper to save hours."""
 
 EPISODES, EPISODES_SEED = 200, 7
-"""Of the evaluations after training, as in training and greedy."""
+"""Episodes and seed of both evaluations after training, sampled and greedy."""
 
 KEPT = ("loss/", "npql/", "prior/", "policy/", "q/", "ap/", "grad_norm/", "faults/")
-"""Metrics of training that are kept beside each evaluation."""
+"""Prefixes of the training metrics that are stored with each evaluation."""
 
 Result = dict[str, Any]
 
 
 def path_of(task: str, row: str, seed: int) -> Path:
-  """Where the result of a run is kept."""
+  """Returns the file of a result."""
   return OUT / f"{task}-{row}-{seed}.json"
 
 
 def options_of(row: str, seed: int) -> list[str]:
-  """In which a run differs from the preset of its task, on the command line."""
+  """Returns the command-line options that change the preset of a task."""
   algorithm, flags, budget = ROWS[row]
   options = (
     f"--env.obs state --agent.algorithm {algorithm} --seed {seed} --no-video "
@@ -120,13 +120,13 @@ def options_of(row: str, seed: int) -> list[str]:
 
 
 def config_of(task: str, row: str, seed: int) -> TrainConfig:
-  """The settings of a run."""
+  """Returns the settings of a run."""
   base = Train(config=load_preset(task))
   return parse(Train, "train", options_of(row, seed), default=base).config
 
 
 def train(task: str, row: str, seed: int) -> None:
-  """One run and its evaluations; the result appears when all are complete."""
+  """Trains and evaluates a run, and writes its result when all is complete."""
   command, path = ["train", task, *options_of(row, seed)], path_of(task, row, seed)
   with tempfile.TemporaryDirectory() as folder:
     run = Path(folder) / "run"
@@ -134,9 +134,11 @@ def train(task: str, row: str, seed: int) -> None:
     subprocess.run([*apnpql, *command, "--run", str(run)], check=True)
     play = f"--episodes {EPISODES} --seed {EPISODES_SEED} --json".split()
     play = [*apnpql, "evaluate", str(run), *play]
+    # "greedy" of the stored results: the highest Q of q, or the mean of a Gaussian.
+    non_parametric = ROWS[row].algorithm == "ap_npql"
     final, greedy = (
-      json.loads(subprocess.check_output([*play, *flags]))
-      for flags in ([], ["--greedy"])
+      json.loads(subprocess.check_output([*play, "--acting", acting]))
+      for acting in ("policy", "greedy" if non_parametric else "mean")
     )
     result = {
       "command": command,
@@ -153,7 +155,7 @@ def train(task: str, row: str, seed: int) -> None:
 
 
 def evaluations(folder: RunFolder) -> list[dict[str, Any]]:
-  """Rows of the held-out evaluations, each with the metrics of training before it."""
+  """Returns the held-out evaluations, each with the training metrics before it."""
   found, last = [], {}
   for row in read_rows(folder.path / "metrics.jsonl"):
     last |= {name: x for name, x in row.items() if name.startswith(KEPT)}
@@ -164,10 +166,10 @@ def evaluations(folder: RunFolder) -> list[dict[str, Any]]:
 
 
 def results() -> dict[tuple[str, str], list[Result]]:
-  """(task, row) -> results of each seed at hand.
+  """Returns (task, row) -> the stored results, one per seed.
 
   Raises:
-    SystemExit: one of them was made with other settings than it would be now.
+    SystemExit: A result was made with other settings than those of this file.
   """
   found: dict[tuple[str, str], list[Result]] = {}
   for task, row in itertools.product(TASKS, ROWS):
@@ -181,7 +183,7 @@ def results() -> dict[tuple[str, str], list[Result]]:
 
 
 def plot(found: dict[tuple[str, str], list[Result]]) -> None:
-  """A panel per task: mean over seeds, and from the lowest to the highest."""
+  """Plots a panel per task: the mean over seeds, and the range between them."""
   figure, panels = plt.subplots(
     1, len(TASKS), figsize=(3.4 * len(TASKS), 3.2), sharey=True, layout="constrained"
   )
@@ -203,7 +205,7 @@ def plot(found: dict[tuple[str, str], list[Result]]) -> None:
 
 
 def table(found: dict[tuple[str, str], list[Result]]) -> str:
-  """Success of each seed after training, and when it was first at the goal."""
+  """Returns a table of the success per seed and the steps to reach the goal."""
   lines = [
     f"| task | row | steps | solved of {EPISODES}, by seed | mean | greedy, by seed "
     f"| first at {100 * GOAL:.0f} % after steps |",
@@ -235,7 +237,7 @@ def _steps_to_goal(run: Result) -> str:
 
 
 def _pool(jobs: int) -> ThreadPoolExecutor:
-  """Returns threads that pin their runs to separate cores, so that none waits."""
+  """Returns threads that pin their runs to separate cores."""
   cores = sorted(os.sched_getaffinity(0))
   shares = iter([cores[i::jobs] or cores for i in range(jobs)])
   return ThreadPoolExecutor(
@@ -244,7 +246,7 @@ def _pool(jobs: int) -> ThreadPoolExecutor:
 
 
 def main() -> None:
-  """Command line; see the module's docstring."""
+  """Runs the command line; see the module's docstring."""
   parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
   parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
   parser.add_argument("--rows", nargs="+", choices=ROWS, default=list(PAPER))
@@ -252,7 +254,7 @@ def main() -> None:
   parser.add_argument("--jobs", type=int, default=1, help="runs at once")
   args = parser.parse_args()
   OUT.mkdir(exist_ok=True)
-  results()  # Refuses before hours are spent.
+  results()  # Fails before hours of training.
   with _pool(args.jobs) as pool:
     runs = [
       pool.submit(train, task, row, seed)
@@ -263,7 +265,7 @@ def main() -> None:
   plot(found)
   (OUT / "table.md").write_text(table(found))
   for run in runs:
-    run.result()  # Raises if it failed; the others are kept.
+    run.result()  # Raises the error of a failed run; the others are stored.
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""Curves and a table of finished runs and their evaluations.
+"""Curves and a table of finished runs.
 
-  apnpql train push_plate --seed 0 --run runs/a        # and so on
+  apnpql train push_plate --seed 0 --run runs/a        # then other seeds
   apnpql evaluate runs/a --episodes 200 --seed 7 --json > runs/a/evaluation.json
   python experiments/results/summarize.py OUT runs/a runs/b runs/c
 
@@ -33,7 +33,7 @@ def evaluations(folder: RunFolder) -> list[dict[str, float]]:
 
 
 def table_row(folder: RunFolder) -> str:
-  """Returns seed, time to the goal, size of the run, final success with interval."""
+  """Returns a row: seed, minutes to the goal, minutes, steps, success, interval."""
   rows = evaluations(folder)
   result = json.loads((folder.path / "evaluation.json").read_text())
   reached = [r for r in rows if r["eval/success_rate"] >= GOAL]

@@ -96,7 +96,7 @@ def left(played: Played) -> set[str]:
 
 
 @pytest.mark.parametrize("flags", ["", *GONE])
-def test_an_ablation_takes_away_what_it_names_and_nothing_else(flags: str):
+def test_an_ablation_removes_only_what_it_names(flags: str):
   played = play(flags)
   for leaf in jax.tree.leaves((played.after, played.metrics)):
     assert np.all(np.isfinite(leaf))
@@ -134,7 +134,7 @@ def test_heads_have_the_outputs_that_the_flag_names(flags, group, shapes):
 
 
 @pytest.mark.parametrize(("target", "policy"), [(10, 500), (500, 10)])
-def test_candidates_are_as_many_as_asked_for(target: int, policy: int):
+def test_candidates_have_the_requested_number(target: int, policy: int):
   flags = f"--agent.target-samples {target} --agent.policy-samples {policy}"
   _, agent, state, _, metrics = play(flags)
   # Before training the values are nearly flat.
@@ -155,7 +155,7 @@ def test_candidates_are_as_many_as_asked_for(target: int, policy: int):
     ("--agent.n-step 1", 4, 1),
   ],
 )
-def test_batches_are_of_the_share_and_the_steps_asked_for(flags, expert, steps):
+def test_batches_have_the_requested_share_and_steps(flags, expert, steps):
   """Every reward of the agent is 1, every reward of the expert is -1."""
 
   def ring(reward: float) -> replay.Replay:

@@ -171,7 +171,7 @@ def test_losses_fall_on_a_fixed_batch(agent, state):
 def test_both_cameras_are_trained_by_the_value(agent, camera: str):
   batch = random_batch(6, batch=2, pixels=True)
   networks = agent.networks
-  params = networks.init(jax.random.key(0), batch.observation_tm1)
+  params = jax.jit(networks.init)(jax.random.key(0), batch.observation_tm1)
 
   def values(params):
     heads = networks.at(params, batch.observation_tm1)
@@ -194,7 +194,7 @@ def test_actions_lie_in_the_action_box(agent, state):
   assert all(v.shape == (BATCH,) for v in info.values())
 
 
-def test_greedy_takes_the_best_candidate(agent, state):
+def test_greedy_takes_the_highest_q(agent, state):
   """The parameters are set to prefer a closed gripper and a fast first joint."""
   params = jax.tree.map(lambda x: x, state.params)
   z = {k: jax.tree.map(jnp.zeros_like, v) for k, v in params["z"].items()}
@@ -206,9 +206,9 @@ def test_greedy_takes_the_best_candidate(agent, state):
   )
   params["z"] = z
   observation = random_batch(8).observation_tm1
-  act = jax.jit(agent.act, static_argnames="greedy")
+  act = jax.jit(agent.act, static_argnames="acting")
   keys = [jax.random.key(k) for k in range(30)]
-  greedy = [act(params, observation, k, greedy=True) for k in keys]
+  greedy = [act(params, observation, k, acting="greedy") for k in keys]
   drawn = [act(params, observation, k) for k in keys]
   for actions, info in greedy:
     np.testing.assert_array_equal(info["q"], info["q_max"])

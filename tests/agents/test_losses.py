@@ -158,7 +158,7 @@ def test_m_step_trains_neither_samples_nor_weights_nor_nu():
   assert all(not np.any(g) for g in jax.tree.leaves(jax.grad(total)(inputs)))
 
 
-def test_m_step_moves_the_prior_towards_the_policy():
+def test_m_step_moves_the_prior_toward_the_policy():
   """Descent lowers KL(q || b), here by weighing the right component (Eq. 3)."""
   prior = random_prior(3, batch=1).replace(logits=jnp.zeros((1, 3)))
   samples = prior.sample(seed=jax.random.key(1), sample_shape=2000)

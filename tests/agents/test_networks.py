@@ -14,9 +14,8 @@ from scipy import ndimage, special
 
 from apnpql_jax.agents import encoder
 from apnpql_jax.agents.columns.policy_evaluation import Categorical
-from apnpql_jax.agents.heads import GROUPS, Heads, Networks
 from apnpql_jax.agents.mixture_head import mixture_from_outputs, one_way_clip
-from apnpql_jax.agents.networks import make_networks
+from apnpql_jax.agents.networks import GROUPS, Heads, Networks, make_networks
 from apnpql_jax.config.checks import IMAGE_FEATURES
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.types import Observation
@@ -27,8 +26,10 @@ CONFIG = AgentConfig(
 
 
 def all_networks(config: AgentConfig = CONFIG) -> Networks:
-  """Networks with every group, and categorical values."""
-  return make_networks(config, GROUPS, Categorical(config))
+  """Returns networks with every group, and categorical values."""
+  evaluation = Categorical(config)
+  head = evaluation.head(config.hidden)
+  return make_networks(config, GROUPS, head, evaluation.value)
 
 
 def observation(batch: int, *, pixels: bool, objects: bool = False) -> Observation:
@@ -196,7 +197,7 @@ def test_points_are_seen_from_the_tool_in_detail_where_they_are_near():
   np.testing.assert_allclose(seen, expected, atol=1e-5)
 
 
-def test_features_tell_a_centimeter_near_the_tool():
+def test_features_resolve_a_centimeter_near_the_tool():
   networks = all_networks()
   seen = observation(1, pixels=False, objects=True)
   params = jax.jit(networks.init)(jax.random.key(0), seen)
@@ -315,7 +316,7 @@ def test_a_learned_mean_is_trained_and_kept_in_the_box():
   assert np.all(mean(bias - 9.0) == -1.0)
 
 
-def test_diagonal_covariances_have_nothing_beside_the_diagonal():
+def test_diagonal_covariances_are_zero_off_the_diagonal():
   heads = fresh_heads(dataclasses.replace(CONFIG, diagonal_covariance=True))
   for mixture in (heads.prior(), heads.policy()):
     scale = np.asarray(mixture.scale_tril)

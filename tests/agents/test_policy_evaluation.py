@@ -58,7 +58,9 @@ def agent_with(algorithm: str, evaluation: str):
     CONFIG, algorithm=algorithm, policy_evaluation=evaluation
   )
   agent = make_agent(config)
-  params = agent.networks.init(jax.random.key(0), random_batch(0).observation_tm1)
+  params = jax.jit(agent.networks.init)(
+    jax.random.key(0), random_batch(0).observation_tm1
+  )
   params["z"] = jax.tree.map(lambda x: 3.0 * x, params["z"])
   params["z"]["out"]["kernel"] = random_array(9, 8, 1)
   return agent, algorithm_of(config), params
@@ -93,7 +95,9 @@ def test_retrace_over_windows_is_the_sum_over_its_definition(algorithm: str):
   ratio = np.exp(np.random.default_rng(4).normal(size=(BATCH, N)))
   log_prob = log_pi - jnp.asarray(np.log(ratio), jnp.float32)
   batch = batch.replace(window=window.replace(log_prob=log_prob))
-  ours = bellman_target(agent.networks, row, agent.evaluation, params, batch, key)
+  ours = bellman_target(
+    agent.networks, row, agent.policy_evaluation, params, batch, key
+  )
   q, step = np.asarray(q[0], np.float64), jax.device_get(window.timestep)
   expected = []
   for i in range(BATCH):
@@ -110,14 +114,16 @@ def test_retrace_over_windows_is_the_sum_over_its_definition(algorithm: str):
 def test_scalar_target_is_the_expected_value_after_the_rewards():
   agent, row, params = agent_with("ap_npql", "td0")
   batch, key = random_batch(4, BATCH), jax.random.key(2)
-  ours = bellman_target(agent.networks, row, agent.evaluation, params, batch, key)
+  ours = bellman_target(
+    agent.networks, row, agent.policy_evaluation, params, batch, key
+  )
   heads = agent.networks.at(params, batch.observation_t)
   q = row.policy(heads, heads.prior(), key, num_samples=6)
   expected = batch.reward_t + batch.discount_t * jnp.sum(q.weights * q.q_values, axis=0)
   np.testing.assert_allclose(ours, expected, rtol=1e-5)
   outputs = random_array(0, BATCH, 1)
   np.testing.assert_allclose(
-    agent.evaluation.loss(outputs, expected),
+    agent.policy_evaluation.loss(outputs, expected),
     rlax.l2_loss(outputs[:, 0], expected),
     rtol=1e-5,
   )
@@ -131,7 +137,9 @@ def test_double_q_takes_the_smaller_and_trains_both():
   slope = jax.grad(lambda x: evaluation.loss(x, target).sum())(outputs)
   np.testing.assert_allclose(slope, outputs - target[:, None], rtol=1e-6)
   agent = make_agent(config)
-  params = agent.networks.init(jax.random.key(0), random_batch(0).observation_tm1)
+  params = jax.jit(agent.networks.init)(
+    jax.random.key(0), random_batch(0).observation_tm1
+  )
   heads = agent.networks.at(params, random_batch(0).observation_tm1)
   first, second = jnp.moveaxis(heads.z(random_array(2, 3, 16, 7)), -1, 0)
   assert first.shape == (3, 16) and np.any(first != second)

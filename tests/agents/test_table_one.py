@@ -17,8 +17,8 @@ from scipy import special
 from apnpql_jax.agents import table_one
 from apnpql_jax.agents.columns import regularizer
 from apnpql_jax.agents.columns.candidates import clip_action
-from apnpql_jax.agents.heads import Heads
 from apnpql_jax.agents.learner import Agent, bellman_target, make_agent, total_loss
+from apnpql_jax.agents.networks import Heads
 from apnpql_jax.agents.table_one import ALGORITHMS, algorithm_of
 from apnpql_jax.config import checks
 from apnpql_jax.dists.action import ActionDistribution, UniformBox
@@ -91,7 +91,7 @@ def example_of(name: str) -> Example:
   rng = np.random.default_rng(0)
   params = jax.tree.map(
     lambda x: x + 0.3 * jnp.asarray(rng.normal(size=x.shape), jnp.float32),
-    agent.networks.init(jax.random.key(0), batch.observation_tm1),
+    jax.jit(agent.networks.init)(jax.random.key(0), batch.observation_tm1),
   )
   trained = {**params, "nu": jnp.float32(NU)}
   # A target network that has fallen behind, as it has in training.
@@ -99,10 +99,10 @@ def example_of(name: str) -> Example:
 
   def losses(trained, batch):
     target = bellman_target(
-      agent.networks, row, agent.evaluation, slow, batch, jax.random.key(1)
+      agent.networks, row, agent.policy_evaluation, slow, batch, jax.random.key(1)
     )
     total, metrics = total_loss(
-      agent.networks, row, agent.evaluation, trained, slow, batch, target, KEY
+      agent.networks, row, agent.policy_evaluation, trained, slow, batch, target, KEY
     )
     parts = {k: v for k, v in metrics.items() if k.startswith("loss/")}
     return parts, (total, metrics)
@@ -131,7 +131,7 @@ def test_each_loss_trains_exactly_the_parameters_the_paper_names(name: str):
 
 
 def test_settings_name_every_evaluation():
-  assert {"row", *table_one.EVALUATIONS} == set(checks.EVALUATIONS)
+  assert {"row", *table_one.POLICY_EVALUATIONS} == set(checks.POLICY_EVALUATIONS)
 
 
 def regularizer_of(name: str, heads: Heads, slow: Heads) -> ActionDistribution:
@@ -214,7 +214,8 @@ def test_actions_are_those_of_the_policy_that_the_row_names(name: str):
   example = example_of(name)
   heads = example.heads(example.trained)
   key, _ = jax.random.split(KEY)
-  _, info = example.agent.act(example.trained, example.batch.observation_tm1, KEY)
+  act = jax.jit(example.agent.act)
+  _, info = act(example.trained, example.batch.observation_tm1, KEY)
   kind = COLUMNS[name].policy
   if kind == "cem":
     expected = np.ones(BATCH)
@@ -226,7 +227,7 @@ def test_actions_are_those_of_the_policy_that_the_row_names(name: str):
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_values_are_learnt_as_the_row_names(name: str):
+def test_values_are_learned_as_the_row_defines(name: str):
   """Outputs of the value head, and whether one reward or a window is read."""
   example, columns = example_of(name), COLUMNS[name]
   batch, window = example.batch, example.batch.window

@@ -2,7 +2,7 @@
 
 A point in R^6 with a gripper must go to an object, close there, and carry it to a
 goal. The reward is +1 once; episodes have at most ten steps. The action primitives are
-the paper's: towards the object, the goal and a neutral place. A quarter of each batch
+the paper's: toward the object, the goal and a neutral place. A quarter of each batch
 comes from an expert.
 """
 
@@ -119,8 +119,8 @@ def step(world: World, action: Array, key: Array) -> World:
 def expert(world: World, key: Array) -> tuple[Array, Array]:
   """Follows the primitives to object and goal, with noise."""
   close = world.holding | world.near(0)
-  towards = world.timestep.primitives
-  action = jnp.where(close[:, None], towards[:, 1], towards[:, 0])
+  toward = world.timestep.primitives
+  action = jnp.where(close[:, None], toward[:, 1], toward[:, 0])
   velocity = action[:, :6]
   done = jnp.clip(velocity + 0.1 * jax.random.normal(key, velocity.shape), -1.0, 1.0)
   log_prob = jnp.sum(jax.scipy.stats.norm.logpdf(done, velocity, 0.1), axis=-1)
@@ -182,7 +182,7 @@ def train_step(agent: Agent, carry, key: Array):
       expert_share=0.25,
       n_step=CONFIG.n_step,
       gamma=CONFIG.gamma,
-      windows=agent.evaluation.windows,
+      windows=agent.policy_evaluation.windows,
     )
     return agent.update(state, batch, key_update)
 

@@ -202,7 +202,7 @@ def test_times_are_of_one_unit_and_programs_take_turns():
   assert figures["of_floor"] == pytest.approx(0.001 / ten.seconds)
 
 
-def test_who_measures_waits_for_who_compiles(tmp_path, monkeypatch):
+def test_measuring_waits_for_compilation(tmp_path, monkeypatch):
   monkeypatch.setenv(turns.FOLDER, str(tmp_path))
   events, compiling = [], threading.Event()
 
@@ -303,7 +303,7 @@ def test_the_documents_are_what_the_stored_reports_make(tmp_path):
     assert copy.read_text() == doc.read_text(), doc.name
 
 
-def test_the_document_is_made_of_what_is_at_hand(tmp_path):
+def test_the_document_uses_the_available_reports(tmp_path):
   doc = tmp_path / "performance.md"
   names = [*performance.BLOCKS, "gpu", "answer"]
   marks = [f"<!-- {name} -->\nas before\n<!-- end {name} -->" for name in names]

@@ -38,6 +38,7 @@ ADDED = {
   "agent.wrist_features": "map",
   "agent.image_shift": 0,
   "agent.color_jitter": 0.0,
+  "eval_acting": "policy",
   "replay.demonstrations": "",
 }
 """Behavior of runs from before these settings existed. No value here may ever
@@ -198,7 +199,7 @@ def test_replay_larger_than_memory_is_rejected():
 
 
 def test_a_replay_must_hold_the_window_of_an_lstm():
-  config = changed("replay.capacity", 256)  # Eight time steps per world.
+  config = changed("replay.capacity", 256)  # Eight instants per world.
   validate(replaced(config, ["agent", "lstm_instants"], 4))
   with pytest.raises(ConfigError, match="replay.capacity=256 .* at least 288"):
     validate(replaced(config, ["agent", "lstm_instants"], 5))

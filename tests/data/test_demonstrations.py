@@ -121,15 +121,15 @@ def test_another_file_needs_no_other_program(demos, env, tmp_path):
   assert len(programs[0]) == 1 and programs[0] == programs[1]
 
 
-def test_the_name_is_the_one_asked_for(tmp_path, demos, env):
+def test_the_file_has_the_requested_name(tmp_path, demos, env):
   for name in ("demos", "demos.v1", "demos.npz"):
-    told = demonstrations.save(
+    summary = demonstrations.save(
       tmp_path / name, demos, task="push_plate", control_period_s=0.15
     )
-    assert told["file"] == str(tmp_path / name)
+    assert summary["file"] == str(tmp_path / name)
     assert (
       demonstrations.load(
-        Path(told["file"]), env.task, env.config.control_period_s
+        Path(summary["file"]), env.task, env.config.control_period_s
       ).instants
       == demos.instants
     )
@@ -150,7 +150,7 @@ class Breaking:
     )
 
 
-def test_an_episode_that_was_not_finite_is_left_out(demos, env):
+def test_a_non_finite_episode_is_left_out(demos, env):
   broken = Env(env.config, env.task, env._bank)
   broken.physics = Breaking(env.physics)
   rest = _record(broken)
@@ -182,7 +182,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_the_scene_cannot_be_in_is_refused(path, demos, env, name):
+def test_states_that_the_scene_cannot_have_are_rejected(path, demos, env, name):
   change, message = WRONG[name]
   wrong = demos._replace(**{name: change(getattr(demos, name))})
   demonstrations.save(path, wrong, task="push_plate", control_period_s=0.15)
@@ -200,7 +200,7 @@ def test_other_files_are_refused_by_name(path, demos, env):
   np.savez(path, format=demonstrations.FORMAT, version=2)
   with pytest.raises(UserError, match="lacks arrays or has extra ones: action"):
     demonstrations.load(path, env.task, env.config.control_period_s)
-  with pytest.raises(UserError, match="no archive"):
+  with pytest.raises(UserError, match="not an .npz archive"):
     demonstrations.load(path.with_name("none"), env.task, env.config.control_period_s)
 
 
@@ -212,7 +212,7 @@ def test_other_files_are_refused_by_name(path, demos, env):
   ),
   st.lists(st.integers(0, 5), max_size=3),
 )
-def test_no_array_in_place_of_another_gets_through(path, env, name, value, shape):
+def test_a_replaced_array_is_rejected(path, env, name, value, shape):
   arrays: dict[str, Any] = dict(np.load(path, allow_pickle=False))
   changed: dict[str, Any] = arrays | {name: np.full(shape, value)}
   np.savez(path, **changed)
@@ -297,7 +297,7 @@ def test_an_even_turn_is_even_between_samples_of_either_sign(tmp_path, demos, en
   np.testing.assert_allclose(found.as_rotvec()[:, 2], angle, atol=1e-4)
 
 
-def test_what_a_recording_cannot_tell_is_asked_for(tmp_path, demos, env):
+def test_an_incomplete_recording_is_rejected_by_name(tmp_path, demos, env):
   whole, path = _recording(env, demos), tmp_path / "recording.npz"
 
   def refused(match: str, **changes: np.ndarray | None) -> None:

@@ -40,7 +40,7 @@ def _one_line(error: pytest.ExceptionInfo[BaseException]) -> bool:
 
 @settings(max_examples=300, deadline=None)
 @given(st.text() | JSON.map(lambda data: json.dumps(data, default=str)))
-def test_no_text_is_taken_for_a_configuration(text: str):
+def test_random_text_is_not_a_configuration(text: str):
   with pytest.raises(UserError) as error:
     config_from_json(text)
   assert _one_line(error)
@@ -92,7 +92,7 @@ def test_a_damaged_archive_is_refused_or_right(archive, tmp_path: Path, edits):
 
 @IN_TMP
 @given(st.binary(max_size=300))
-def test_bytes_are_no_archive(tmp_path: Path, data: bytes):
+def test_random_bytes_are_not_an_archive(tmp_path: Path, data: bytes):
   (tmp_path / "a.npz").write_bytes(data)
   with pytest.raises(UserError) as error:
     npz.read(tmp_path / "a.npz", limit=10_000)
@@ -105,7 +105,7 @@ def test_nothing_in_an_archive_is_executed(tmp_path: Path):
       return (Path.touch, (tmp_path / "executed",))
 
   np.savez(tmp_path / "a.npz", a=np.array([Trap()], dtype=object))
-  with pytest.raises(UserError, match="no plain array"):
+  with pytest.raises(UserError, match="not a plain array"):
     npz.read(tmp_path / "a.npz", limit=10_000)
   assert not (tmp_path / "executed").exists()
 
@@ -142,8 +142,8 @@ def test_a_configuration_of_gigabytes_is_not_read(tmp_path: Path):
     run_folder.load_run_config(run)
 
 
-def test_no_module_can_run_what_a_file_says():
-  """pickle, and what is made of it, is imported nowhere; NumPy is told so each time."""
+def test_no_module_can_execute_the_content_of_a_file():
+  """No module imports pickle or what builds on it, and every NumPy call disables it."""
   package = Path(apnpql_jax.__file__).parent
   words = ("import pickle", "import dill", "import shelve", "import joblib", "marshal")
   for path in package.rglob("*.py"):

@@ -369,7 +369,7 @@ def test_empty_agent_replay_has_no_weight_and_keeps_the_share():
 
 def test_chunks_that_do_not_fit_are_refused_when_traced():
   replay = rb.create(_example(), 12, WORLDS)
-  with pytest.raises(ValueError, match="5 steps does not divide 12"):
+  with pytest.raises(ValueError, match="5 instants does not divide a ring of 12"):
     jax.eval_shape(rb.add, replay, _stream(5, WORLDS, 0.1, seed=0))
   with pytest.raises(ValueError, match="the ring takes"):
     jax.eval_shape(rb.add, replay, _stream(4, WORLDS + 1, 0.1, seed=0))

@@ -1,4 +1,4 @@
-"""The non-parametric policy against rlax and scipy; its limits: test_properties."""
+"""The non-parametric policy and its KL limit, against rlax and scipy."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import pytest
 import rlax
 from scipy import optimize, special
 
+from apnpql_jax.agents import losses
 from apnpql_jax.dists import boltzmann
 
 SAMPLES = 100
@@ -19,7 +20,7 @@ def random_q(seed: int, batch: int = 8) -> jax.Array:
   return jnp.asarray(rng.beta(0.5, 1.0, size=(SAMPLES, batch)), jnp.float32)
 
 
-def test_weights_and_dual_match_rlax():
+def test_weights_and_alpha_loss_are_those_of_rlax():
   q, alpha = random_q(0), jnp.geomspace(0.02, 2.0, 8)
   expected, weights, _ = rlax.mpo_compute_weights_and_temperature_loss(
     sample_q_values=q,
@@ -27,7 +28,7 @@ def test_weights_and_dual_match_rlax():
     projection_operator=lambda x: x,
     sample_axis=0,
   )
-  ours = boltzmann.dual(q, alpha, epsilon=1.5)
+  ours = losses.alpha_loss(q, alpha, epsilon=1.5)
   np.testing.assert_allclose(ours, expected, rtol=1e-5, atol=1e-6)
   np.testing.assert_allclose(boltzmann.importance_weights(q, alpha), weights, atol=1e-6)
 
@@ -46,17 +47,10 @@ def test_the_limit_holds_exactly_at_the_minimum_of_the_dual(epsilon: float):
     found = optimize.minimize_scalar(dual, bounds=(-9.0, 4.0), method="bounded")
     alpha = jnp.exp(jnp.full((1,), found.x, jnp.float32))
     one = q[:, i : i + 1]
-    ours = boltzmann.dual(one, alpha, epsilon=epsilon)[0]
+    ours = losses.alpha_loss(one, alpha, epsilon=epsilon)[0]
     assert ours == pytest.approx(found.fun, rel=1e-4)
     kl = boltzmann.kl_to_prior(boltzmann.importance_weights(one, alpha))[0]
     assert kl == pytest.approx(epsilon, abs=5e-3)
-
-
-def test_slope_of_the_dual_is_the_slack_of_the_limit():
-  q, alpha = random_q(2), jnp.geomspace(0.02, 1.0, 8)
-  slope = jax.grad(lambda a: jnp.sum(boltzmann.dual(q, a, epsilon=1.0)))(alpha)
-  kl = boltzmann.kl_to_prior(boltzmann.importance_weights(q, alpha))
-  np.testing.assert_allclose(slope, 1.0 - kl, atol=1e-4)
 
 
 def test_pick_follows_the_weights():

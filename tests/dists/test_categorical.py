@@ -78,18 +78,6 @@ def test_expectation_over_actions_commutes_with_the_projection():
   np.testing.assert_allclose(before, after, atol=1e-6)
 
 
-def test_cross_entropy_of_the_projection_is_the_td_loss_of_rlax():
-  probs, reward, discount = random_case(5)
-  rng = np.random.default_rng(6)
-  logits_tm1 = jnp.asarray(rng.normal(size=probs.shape), jnp.float32)
-  expected = jax.vmap(rlax.categorical_td_learning, (None, 0, 0, 0, None, 0))(
-    ATOMS, logits_tm1, reward, discount, ATOMS, jnp.log(probs)
-  )
-  target = categorical.project(probs, reward, discount, ATOMS)
-  ours = categorical.cross_entropy(target, logits_tm1)
-  np.testing.assert_allclose(ours, expected, rtol=1e-4)
-
-
 @pytest.mark.parametrize("expected", [-0.9, 0.0, 0.5, 1.97])
 def test_broadest_logits_have_the_mean_and_the_largest_entropy(expected: float):
   atoms = np.asarray(ATOMS, np.float64)

@@ -18,10 +18,10 @@ from apnpql_jax.errors import ConfigError
 from apnpql_jax.sim import arm
 from apnpql_jax.training import evaluate
 from apnpql_jax.training.evaluate import play_held_out
-from apnpql_jax.training.expert import example_slot
 from apnpql_jax.training.rollout import (
   FILMED,
   agent_policy,
+  example_slot,
   expert_policy,
   make_player,
   rollout,
@@ -82,9 +82,10 @@ def test_held_out_rows_are_never_trained_on(env):
 @pytest.mark.parametrize("noise", [0.1, 0.0])
 def test_density_of_the_expert_is_that_of_its_noise(env, noise: float):
   """Without noise it is far higher than that of any other policy."""
-  state = env.reset(jnp.arange(16))
-  action, log_prob = expert_policy(env, noise=noise)(state, jax.random.key(0))
-  mean = env.expert_action(state)[..., :6]
+  state = jax.jit(env.reset)(jnp.arange(16))
+  policy = jax.jit(expert_policy(env, noise=noise))
+  action, log_prob = policy(state, jax.random.key(0))
+  mean = jax.jit(env.expert_action)(state)[..., :6]
   expected = stats.norm.logpdf(action[..., :6], mean, max(noise, 1e-6)).sum(-1)
   np.testing.assert_allclose(log_prob, expected, rtol=1e-3)
   assert np.all(np.asarray(log_prob) > 60.0) == (noise == 0.0)
@@ -123,12 +124,12 @@ def test_the_replay_returns_the_observations_that_the_lstm_acted_on(env):
     weights = jax.random.normal(jax.random.key(0), flat.shape[1:])
     return jnp.tanh(flat @ weights / 10.0)
 
-  def act(params, observation: Observation, key, *, greedy):
+  def act(params, observation: Observation, key, *, acting):
     action = jnp.full((16, 7), 0.5).at[:, 0].set(velocity(observation))
     return action, {"log_prob": jnp.zeros(16)}
 
   agent = dataclasses.replace(make_agent(AgentConfig()), act=act)
-  policy = agent_policy(agent, {}, greedy=False)
+  policy = agent_policy(agent, {}, acting="policy")
 
   @jax.jit
   def play(key):

@@ -100,7 +100,7 @@ def test_refinement_starts_from_the_nearer_configuration(task):
   np.testing.assert_allclose(refined, solution, atol=1e-3)
 
 
-def test_following_scales_all_joints_alike():
+def test_following_scales_all_joints_by_one_factor():
   """The speed is limited far from the target, brakes nearer, and is linear close by."""
   velocity = tracking.follow(jnp.array([2.0, -1.0, 0, 0, 0, 0]), jnp.zeros(6))
   np.testing.assert_allclose(velocity, [1.0, -0.5, 0, 0, 0, 0], rtol=1e-6)

@@ -14,8 +14,8 @@ import pytest
 
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.errors import UserError
-from apnpql_jax.runs import run_folder, text, versions
-from apnpql_jax.runs.versions import changed_versions
+from apnpql_jax.runs import provenance, run_folder, text
+from apnpql_jax.runs.provenance import changed_versions
 
 CONFIG = TrainConfig(env=EnvConfig(worlds=64), seed=3)
 
@@ -28,7 +28,7 @@ def test_a_new_run_is_opened_with_the_same_configuration(tmp_path: Path):
   assert names == {"config.json", "versions.json"}
 
 
-def test_versions_tell_what_the_run_was_made_with(tmp_path: Path):
+def test_versions_describe_the_start_of_a_run(tmp_path: Path):
   folder = run_folder.create(tmp_path / "run", CONFIG)
   versions = json.loads((folder.path / "versions.json").read_text())
   assert versions["python"] == platform.python_version()
@@ -37,7 +37,7 @@ def test_versions_tell_what_the_run_was_made_with(tmp_path: Path):
   assert versions["device"]["count"] == jax.device_count()
 
 
-def test_git_commit_is_that_of_the_package_and_of_nobody_else(tmp_path: Path):
+def test_git_commit_is_that_of_the_package_only(tmp_path: Path):
   def git(*args: str) -> str:
     identity = ["-c", "user.name=t", "-c", "user.email=t@t"]
     command = ["git", "-C", str(tmp_path), *identity, *args]
@@ -48,17 +48,17 @@ def test_git_commit_is_that_of_the_package_and_of_nobody_else(tmp_path: Path):
   package = tmp_path / "package"
   package.mkdir()
   (package / "__init__.py").write_text("a = 1\n")
-  assert versions._git(package) is None
+  assert provenance._git(package) is None
   git("init", "-q")
   # Installed inside a repository that does not track it.
   git("commit", "-q", "--allow-empty", "-m", "other")
-  assert versions._git(package) is None
+  assert provenance._git(package) is None
   git("add", "package")
   git("commit", "-q", "-m", "mine")
   commit = git("rev-parse", "HEAD")
-  assert versions._git(package) == {"commit": commit, "dirty": False}
+  assert provenance._git(package) == {"commit": commit, "dirty": False}
   (package / "__init__.py").write_text("a = 2\n")
-  assert versions._git(package) == {"commit": commit, "dirty": True}
+  assert provenance._git(package) == {"commit": commit, "dirty": True}
 
 
 def test_changed_versions_are_listed(tmp_path: Path):
@@ -94,7 +94,7 @@ def test_a_run_is_replaced_only_when_asked(tmp_path: Path):
   assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
-def test_a_folder_that_is_no_run_is_never_removed(tmp_path: Path):
+def test_a_folder_other_than_a_run_is_never_removed(tmp_path: Path):
   thesis = tmp_path / "thesis.txt"
   thesis.write_text("years of work")
   for overwrite in (False, True):
@@ -108,7 +108,7 @@ def test_a_folder_that_is_no_run_is_never_removed(tmp_path: Path):
   assert run_folder.create(empty, CONFIG).config == CONFIG
 
 
-def test_what_is_no_run_is_not_opened(tmp_path: Path):
+def test_only_a_run_folder_is_opened(tmp_path: Path):
   for path in (tmp_path, tmp_path / "missing"):
     with pytest.raises(UserError, match="not a run folder") as error:
       run_folder.open_run(path)

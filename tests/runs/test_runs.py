@@ -38,15 +38,15 @@ def test_configuration_of_a_run_is_read_back(tmp_path):
   assert run_folder.load_run_config(write_run(tmp_path / "a", config)) == config
 
 
-def test_a_run_made_before_a_setting_came_is_read_and_that_is_said(tmp_path):
+def test_a_run_older_than_a_setting_is_read_with_a_warning(tmp_path):
   config = TrainConfig(seed=3, agent=AgentConfig(gamma=0.9))
   run = write_run(tmp_path / "a", config)
   data = json.loads((run / "config.json").read_text())
   del data["agent"]["residual_blocks"]
   (run / "config.json").write_text(json.dumps(data))
-  said: list[str] = []
-  assert run_folder.load_run_config(run, said.append) == config
-  assert said == [
+  warnings: list[str] = []
+  assert run_folder.load_run_config(run, warnings.append) == config
+  assert warnings == [
     f"{run}/config.json is older than some settings, which keep their old behavior: "
     "agent.residual_blocks 0"
   ]
@@ -72,8 +72,8 @@ def test_resume_may_change_only_what_does_not_alter_learning(tmp_path):
   run = write_run(tmp_path / "a")
   for name in run_folder.MAY_CHANGE:
     value = getattr(TrainConfig(), name)
-    other = {bool: lambda x: not x, int: lambda x: x + 1, tuple: lambda x: (*x, "a")}
-    other = other[type(value)](value)
+    others = {bool: lambda x: not x, int: lambda x: x + 1, tuple: lambda x: (*x, "a")}
+    other = "mean" if name == "eval_acting" else others[type(value)](value)
     run_folder.check_resumable(run, dataclasses.replace(TrainConfig(), **{name: other}))
   fixed = {f.name for f in dataclasses.fields(TrainConfig)} - set(run_folder.MAY_CHANGE)
   for name in fixed - {"env", "agent", "replay"}:
@@ -82,7 +82,7 @@ def test_resume_may_change_only_what_does_not_alter_learning(tmp_path):
       run_folder.check_resumable(run, dataclasses.replace(TrainConfig(), **changed))
 
 
-def test_a_run_that_is_trained_is_left_alone(tmp_path):
+def test_a_run_in_training_is_not_replaced(tmp_path):
   run, other = write_run(tmp_path / "run"), write_run(tmp_path / "other")
   with run_folder.lock(run), run_folder.lock(other):
     for refused in (
@@ -90,7 +90,7 @@ def test_a_run_that_is_trained_is_left_alone(tmp_path):
       lambda: run_folder.check_free(run, overwrite=True),
       lambda: run_folder.lock(run).__enter__(),
     ):
-      with pytest.raises(UserError, match="run' is trained by another process"):
+      with pytest.raises(UserError, match="run' is being trained by another process"):
         refused()
     run_folder.load_run_config(run)
   run_folder.check_resumable(run, TrainConfig())

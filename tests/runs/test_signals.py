@@ -46,7 +46,7 @@ def _busy(phase: str) -> subprocess.Popen[str]:
   return process
 
 
-def _said(process: subprocess.Popen[str]) -> list[str]:
+def _printed(process: subprocess.Popen[str]) -> list[str]:
   assert process.stdout is not None
   return process.stdout.read().splitlines()
 
@@ -63,7 +63,7 @@ def test_with_nothing_to_save_the_first_signal_ends_the_process(phase, number, w
   with _busy(phase) as process:
     process.send_signal(number)
     assert process.wait(10) == 128 + number
-    assert _said(process) == [f"apnpql: {words}"]
+    assert _printed(process) == [f"apnpql: {words}"]
 
 
 def test_a_second_signal_does_not_wait_but_one_sent_twice_is_one():
@@ -75,7 +75,7 @@ def test_a_second_signal_does_not_wait_but_one_sent_twice_is_one():
       process.wait(1.5)
     process.send_signal(signal.SIGINT)
     assert process.wait(10) == 128 + signal.SIGINT
-    finishing, stopped = _said(process)
+    finishing, stopped = _printed(process)
     assert finishing.startswith("finishing this iteration")
     assert stopped == "apnpql: stopped at once"
 
@@ -92,7 +92,7 @@ main.main(["list"])
 """
 
 
-def test_the_exit_code_tells_even_where_no_line_can_be_written():
+def test_the_exit_code_is_right_even_if_no_line_can_be_written():
   with open("/dev/full", "w") as full:  # As standard error on the disk that is full.
     root = Path(__file__).parents[2]
     command = [sys.executable, "-c", STOPPED]

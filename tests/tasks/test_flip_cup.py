@@ -153,7 +153,7 @@ def test_success_has_limits(task, resets, half, kinematics, shift, turn, expecte
   assert (judge(task, state, kinematics) == expected).all()
 
 
-def test_a_lying_cup_is_no_success(task, resets, half, kinematics):
+def test_a_lying_cup_is_not_success(task, resets, half, kinematics):
   lying = Rotation.from_euler("x", np.pi / 2)
   state = on_goal(task, resets, half[:, 0], turn=lying)
   assert not judge(task, state, kinematics).any()
@@ -175,7 +175,7 @@ def test_a_dropped_cup_counts_if_it_lands_upright(
 
 
 @pytest.mark.parametrize(("dof", "speed", "rests"), MOTIONS)
-def test_a_moving_cup_is_no_success(task, solved, kinematics, dof, speed, rests):
+def test_a_moving_cup_is_not_success(task, solved, kinematics, dof, speed, rests):
   state = moving(task, solved, "cup", dof, speed)
   assert (judge(task, state, kinematics) == rests).all()
 

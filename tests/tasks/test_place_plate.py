@@ -46,7 +46,7 @@ def task():
 
 
 def lying(steep=0.0, heading=0.0) -> Rotation:
-  """Returns the rotation of a plate tilted by ``steep`` towards ``heading``."""
+  """Returns the rotation of a plate tilted by ``steep`` toward ``heading``."""
   return Rotation.from_euler("ZY", [heading, steep])
 
 
@@ -228,7 +228,7 @@ def test_the_goal_is_where_the_box_is(task, resets, solved, kinematics):
 
 
 @pytest.mark.parametrize(("dof", "speed", "rests"), MOTIONS)
-def test_a_moving_plate_is_no_success(task, solved, kinematics, dof, speed, rests):
+def test_a_moving_plate_is_not_success(task, solved, kinematics, dof, speed, rests):
   state = moving(task, solved, "plate", dof, speed)
   assert (judge(task, state, kinematics) == rests).all()
 
@@ -250,7 +250,7 @@ def test_the_hand_must_be_away(
   assert (judge(task, state, hand) == expected).all()
 
 
-def test_a_plate_that_is_still_held_is_no_success(task, solved, kinematics, neutral):
+def test_a_plate_in_the_hand_is_not_success(task, solved, kinematics, neutral):
   held = with_gap(task, solved, THICKNESS)
   assert not judge(task, held, hand_at(task, held, kinematics, neutral)).any()
 

@@ -81,7 +81,7 @@ def test_the_plate_must_lie_flat(task, solved, axis, angle, expected):
   assert (judge(task, turned(task, solved, axis, angle)) == expected).all()
 
 
-def test_a_plate_that_lies_upside_down_is_no_success(task, solved, rest):
+def test_a_plate_upside_down_is_not_success(task, solved, rest):
   """Only its floor touches the table, so that its center is as low as when upright."""
   state = rest(turned(task, solved, "x", np.pi))
   np.testing.assert_allclose(pos(task, state, "plate")[:, 2], 0.003, atol=1e-3)
@@ -95,7 +95,7 @@ def test_a_dropped_plate_counts_when_it_has_landed(task, solved, rest):
 
 
 @pytest.mark.parametrize(("dof", "speed", "rests"), MOTIONS)
-def test_a_moving_plate_is_no_success(task, solved, dof, speed, rests):
+def test_a_moving_plate_is_not_success(task, solved, dof, speed, rests):
   assert (judge(task, moving(task, solved, "plate", dof, speed)) == rests).all()
 
 

@@ -151,7 +151,7 @@ def test_blue_must_be_on_the_table(task, solved, kinematics, height, expected):
   assert (judge(task, solved, kinematics) == expected).all()
 
 
-def test_blue_on_yellow_is_no_success(task, resets, kinematics):
+def test_blue_on_yellow_is_not_success(task, resets, kinematics):
   state = put(task, resets, "blue", pos(task, resets, "yellow") + jnp.array(ON_BLUE))
   assert not judge(task, state, kinematics).any()
 
@@ -174,7 +174,7 @@ def test_a_box_may_lie_on_any_face(task, solved, kinematics, body, axis, angle):
 
 
 @pytest.mark.parametrize("angle", [0.35, np.pi / 4])
-def test_a_yellow_box_that_is_tipped_is_no_success(task, solved, kinematics, angle):
+def test_a_tipped_yellow_box_is_not_success(task, solved, kinematics, angle):
   """It stands on an edge, which raises its center."""
   height = stack_box.SIDE / 2 * (np.cos(angle) + np.sin(angle) - 1)
   state = turned(task, solved, "yellow", Rotation.from_euler("y", angle))
@@ -199,7 +199,7 @@ def test_the_hand_must_be_away(task, solved, kinematics, axis, distance, expecte
   assert (state == expected).all()
 
 
-def test_a_box_that_is_still_held_is_no_success(task, solved, kinematics, neutral):
+def test_a_box_in_the_hand_is_not_success(task, solved, kinematics, neutral):
   held = with_gap(task, solved, stack_box.SIDE)
   hand = hand_at(task, held, kinematics, neutral, (0.0, 0.0, 0.0))
   assert not judge(task, held, hand).any()

@@ -26,7 +26,7 @@ from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.errors import UserError
 from apnpql_jax.runs import checkpoint_reader, leaves, run_folder
 from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
-from apnpql_jax.training import faults, resume
+from apnpql_jax.training import resume, skipped_updates
 from apnpql_jax.training.expert import collect_expert, empty_expert
 from apnpql_jax.training.iteration import make_iteration, make_sample
 from apnpql_jax.training.state import TrainState, initial_state
@@ -202,7 +202,7 @@ def test_a_state_saved_without_replay_continues_with_an_older_one(
   example = jax.eval_shape(lambda: jax.tree.map(jnp.copy, after))
   warnings: list[str] = []
   restored = resume.restore(built.config, tmp_path, example, warnings.append)
-  assert warnings == ["its replay is that of step 24"]
+  assert warnings == ["its replay comes from step 24"]
   assert _bits(restored.replace(replay=None)) == _bits(after.replace(replay=None))
   assert int(restored.replay.cursor) == int(before.replay.cursor)
   # The next slots do not continue the newest one, which is now marked as an end.
@@ -244,7 +244,7 @@ def test_a_broken_world_restarts_and_its_episode_is_never_drawn(
     drawn = jax.tree.leaves((batch.observation_tm1, batch.observation_t))
     assert all(jnp.isfinite(x).all() for x in drawn)
     robot = np.asarray(after.replay.slots.timestep.observation.robot)[newest, 1]
-    # With an LSTM a start is a window of time steps.
+    # With an LSTM a start is a window of instants.
     starts = np.asarray(batch.observation_tm1.robot)[batch.weight > 0]
     starts = starts.reshape(-1, robot.shape[-1])
     assert not (starts[:, None, :] == robot[None]).all(-1).any()
@@ -297,11 +297,11 @@ def test_after_several_skipped_updates_the_run_stops_and_they_can_be_repeated(
   built, iteration, state, tmp_path: Path, capsys
 ):
   run = run_folder.create(tmp_path / "run", built.config).path
-  faults.check(built.config, state, run)
+  skipped_updates.check(built.config, state, run)
   assert not (run / "faults").exists()
   after, _ = iteration(_poison_replay(state))
-  with pytest.raises(errors.RunStopped, match="2 updates in a row") as stop:
-    faults.check(built.config, after, run)
+  with pytest.raises(errors.RunStopped, match="2 consecutive updates") as stop:
+    skipped_updates.check(built.config, after, run)
   assert stop.value.code == errors.FAILED
   (file,) = (run / "faults").iterdir()
   # The message ends with a command that works verbatim.
@@ -314,7 +314,7 @@ def test_after_several_skipped_updates_the_run_stops_and_they_can_be_repeated(
   arrays: dict[str, Any] = dict(np.load(file, allow_pickle=False))
   zeros = {k: np.zeros_like(x) for k, x in arrays.items() if "/reward" in k}
   np.savez(file, **(arrays | zeros))
-  assert not any(faults.repeat(file).values())
+  assert not any(skipped_updates.repeat(file).values())
   np.savez(file, **{k: v for k, v in arrays.items() if k != "key"})
   with pytest.raises(UserError, match="not an update of this run: 'key'"):
-    faults.repeat(file)
+    skipped_updates.repeat(file)

@@ -8,10 +8,6 @@ import dataclasses
 import inspect
 import json
 from pathlib import Path
-import signal
-import subprocess
-import sys
-import time
 
 import imageio.v3 as iio
 import numpy as np
@@ -27,7 +23,7 @@ from apnpql_jax.training.train import train
 from apnpql_jax.training.video import HOLD
 
 CONFIG = TrainConfig(
-  env=EnvConfig(worlds=4, bank_rows=256, time_limit_s=1.5, backend="native"),
+  env=EnvConfig(worlds=4, bank_rows=256, time_limit_s=0.75, backend="native"),
   agent=AgentConfig(
     hidden=(32, 32), feature_dim=32, target_samples=16, policy_samples=16
   ),
@@ -115,13 +111,13 @@ def test_a_run_writes_all_its_files(finished):
 
 def test_evaluate_reports_the_newest_checkpoint(finished, tmp_path):
   run_dir, _ = finished
-  video = tmp_path / "videos" / "four.mp4"
-  figures = evaluate(str(run_dir), episodes=4, seed=3, greedy=True, video=str(video))
+  video = tmp_path / "videos" / "two.mp4"
+  figures = evaluate(str(run_dir), episodes=2, seed=3, acting="mean", video=str(video))
   assert figures["checkpoint_step"] == 64
-  assert figures["episodes"] == 4 and figures["greedy"]
-  # All time steps of all four, the last of each held.
+  assert figures["episodes"] == 2 and figures["acting"] == "mean"
+  # All instants of both, the last of each held.
   frames = len(iio.imread(next(video.parent.iterdir()), plugin="pyav"))
-  assert frames == 4 * (figures["mean_length"] + HOLD)
+  assert frames == 2 * (figures["mean_length"] + HOLD)
   assert figures["backend"] == "native" and figures["algorithm"] == "ap_npql"
   low, high = figures["ci95"]
   assert 0 <= low <= figures["success_rate"] <= high <= 1
@@ -167,29 +163,3 @@ def test_resume_rejects_other_settings(finished):
   )
   with pytest.raises(UserError, match=r"agent\.gamma 0\.99 -> 0\.9"):
     train(other, run_dir, resume=True)
-
-
-def test_ctrl_c_ends_the_run_with_a_checkpoint(tmp_path):
-  run_dir = tmp_path / "run"
-  command = [sys.executable, "-m", "apnpql_jax", "train", "push_plate"]
-  command += "--obs state --env.worlds 4 --env.bank-rows 256 --no-video".split()
-  command += "--replay.capacity 512 --replay.expert-steps 128".split()
-  command += "--total-steps 1000000 --eval-every 1000000".split()
-  command += "--checkpoint-every 1000000".split()
-  log = tmp_path / "log.txt"
-  with log.open("w") as file:
-    process = subprocess.Popen([*command, "--run", str(run_dir)], stderr=file)
-  try:
-    metrics = run_dir / "metrics.jsonl"
-    deadline = time.monotonic() + 300
-    while not (metrics.exists() and metrics.read_text()):
-      assert process.poll() is None and time.monotonic() < deadline
-      time.sleep(0.5)
-    process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=60) == 130
-  finally:
-    process.kill()
-  (step,) = checkpoint_reader.all_steps(run_dir)
-  rows = [json.loads(line) for line in metrics.read_text().splitlines()]
-  assert rows[-1]["step"] == step
-  assert f"saved at step {step}; to continue: --resume {run_dir}" in log.read_text()

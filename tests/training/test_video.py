@@ -106,7 +106,7 @@ def test_a_video_that_cannot_be_written_is_an_error(tmp_path):
     video.write_video(tmp_path / "full.mp4", _frames(2, 24, 36), fps=5)
 
 
-def test_gif_if_the_path_says_so(tmp_path):
+def test_a_path_that_ends_in_gif_makes_a_gif(tmp_path):
   frames = _frames(3, 24, 36)
   path = video.write_video(tmp_path / "episode.gif", frames, fps=5)
   assert path == tmp_path / "episode.gif"

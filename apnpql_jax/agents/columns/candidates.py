@@ -7,9 +7,11 @@ import math
 from flax import struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from apnpql_jax.agents.networks import Heads
 from apnpql_jax.dists.action import ActionDistribution
+from apnpql_jax.types import Array
 
 
 class Candidates(struct.PyTreeNode):
@@ -46,3 +48,17 @@ class Candidates(struct.PyTreeNode):
 def clip_action(actions: Float[Array, "*b 7"]) -> Float[Array, "*b 7"]:
   """Clips joint velocities to [-1, 1] rad/s; leaves the gripper in {0, 1} unchanged."""
   return jnp.clip(actions, -1.0, 1.0)
+
+
+def score(
+  heads: Heads, samples: Float[Array, " s *b 7"]
+) -> tuple[Float[Array, " s *b 7"], Float[Array, " s *b n"], Float[Array, " s *b"]]:
+  """Returns clipped actions, the outputs of the value head, and Q."""
+  actions = clip_action(samples)
+  outputs = heads.z(actions)
+  return actions, outputs, heads.networks.value(outputs)
+
+
+def all_on_the_highest(x: Float[Array, " s *b"]) -> Float[Array, " s *b"]:
+  """Returns weights that select the highest score over S."""
+  return jax.nn.one_hot(jnp.argmax(x, axis=0), x.shape[0], axis=0, dtype=x.dtype)

@@ -1,16 +1,22 @@
 """Policies as weighted candidate actions (Table I, column "policy").
 
 Each takes the heads at a batch of states, the regularizer b at the same states, a key
-and the number S of candidates. If ``greedy``, all weight is on the best candidate.
+and the number S of candidates. ``agents/acting.py`` chooses one of them.
 """
 
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
 
-from apnpql_jax.agents.columns.candidates import Candidates, clip_action
-from apnpql_jax.agents.heads import Heads
+from apnpql_jax.agents.columns.candidates import (
+  Candidates,
+  all_on_the_highest,
+  clip_action,
+  score,
+)
+from apnpql_jax.agents.networks import Heads
 from apnpql_jax.dists import boltzmann
 from apnpql_jax.dists.action import ActionDistribution
 from apnpql_jax.dists.gmm import GripperGMM
@@ -24,10 +30,9 @@ CEM_MIN_STD = 0.01  # rad/s; floor of the elites' deviation, to keep draws apart
 def non_parametric(
   heads: Heads,
   prior: ActionDistribution,
-  key: Array,
+  key: PRNGKeyArray,
   *,
   num_samples: int,
-  greedy: bool = False,
 ) -> Candidates:
   """Samples q = b exp(Q / alpha) / Z by self-normalized importance sampling (Eq. 6).
 
@@ -35,39 +40,33 @@ def non_parametric(
   """
   heads, prior = heads.frozen(), jax.lax.stop_gradient(prior)
   samples = prior.sample(seed=key, sample_shape=num_samples)
-  actions, outputs, q_values = _evaluate(heads, samples)
+  actions, outputs, q_values = score(heads, samples)
   alpha = heads.alpha()
   weights = boltzmann.importance_weights(q_values, alpha)
-  weights = _all_on_the_highest(q_values) if greedy else weights
   return Candidates(samples, actions, outputs, q_values, weights, prior, 1.0 / alpha)
 
 
 def parametric(
   heads: Heads,
   prior: ActionDistribution,
-  key: Array,
+  key: PRNGKeyArray,
   *,
   num_samples: int,
-  greedy: bool = False,
 ) -> Candidates:
   """Samples the arm from pi_psi and pairs each draw with both gripper commands.
 
   The two candidates of a draw share its weight in proportion to their density under
   pi, so the sum over the gripper is exact. S is rounded down to an even number.
-  Gradients reach only psi, through draws and weights. If greedy, the mean replaces the
-  draws and has all weight on its likelier gripper command.
+  Gradients reach only psi, through draws and weights.
   """
   del prior
   policy = heads.policy()
-  drawn = policy.sample(seed=key, sample_shape=1 if greedy else num_samples // 2)
-  if greedy:
-    drawn = drawn.at[..., :ARM_DOF].set(policy.loc[None, ..., 0, :])
+  drawn = policy.sample(seed=key, sample_shape=num_samples // 2)
   both = jnp.stack([drawn.at[..., -1].set(gripper) for gripper in (0.0, 1.0)])
   samples = both.reshape(-1, *drawn.shape[1:])
-  actions, outputs, q_values = _evaluate(heads.frozen(), samples)
+  actions, outputs, q_values = score(heads.frozen(), samples)
   log_prob = policy.log_prob(samples).reshape(both.shape[:-1])
   weights = jax.nn.softmax(log_prob, axis=0).reshape(q_values.shape) / drawn.shape[0]
-  weights = _all_on_the_highest(weights) if greedy else weights
   tilt = jnp.zeros(q_values.shape[1:])
   return Candidates(samples, actions, outputs, q_values, weights, policy, tilt)
 
@@ -75,38 +74,25 @@ def parametric(
 def cem(
   heads: Heads,
   prior: ActionDistribution,
-  key: Array,
+  key: PRNGKeyArray,
   *,
   num_samples: int,
-  greedy: bool = False,
 ) -> Candidates:
   """Finds the best action by the cross-entropy method (QT-Opt), starting from b.
 
   All weight is on the best action of the last draw, without gradient.
   """
-  del num_samples, greedy
+  del num_samples
   heads, base = heads.frozen(), jax.lax.stop_gradient(prior)
   *keys, last = jax.random.split(key, CEM_ITERATIONS)
   for k in keys:
     samples = base.sample(seed=k, sample_shape=CEM_SAMPLES)
-    base = _refit(samples, _evaluate(heads, samples)[2], heads.config.policy_min_prob)
+    base = _refit(samples, score(heads, samples)[2], heads.config.policy_min_prob)
   samples = base.sample(seed=last, sample_shape=CEM_SAMPLES)
-  actions, outputs, q_values = _evaluate(heads, samples)
-  weights = _all_on_the_highest(q_values)
+  actions, outputs, q_values = score(heads, samples)
+  weights = all_on_the_highest(q_values)
   tilt = jnp.zeros(q_values.shape[1:])
   return Candidates(samples, actions, outputs, q_values, weights, base, tilt)
-
-
-def _evaluate(heads: Heads, samples: Array) -> tuple[Array, Array, Array]:
-  """Returns clipped actions, outputs of the value head and Q, each [S, *b, ...]."""
-  actions = clip_action(samples)
-  outputs = heads.z(actions)
-  return actions, outputs, heads.networks.value(outputs)
-
-
-def _all_on_the_highest(x: Array) -> Array:
-  """Returns weights that select the highest of [S, *b] over S."""
-  return jax.nn.one_hot(jnp.argmax(x, axis=0), x.shape[0], axis=0, dtype=x.dtype)
 
 
 def _refit(samples: Array, q_values: Array, min_prob: float) -> GripperGMM:

@@ -19,8 +19,8 @@ import numpy as np
 
 from apnpql_jax.agents import losses
 from apnpql_jax.agents.columns.candidates import Candidates
-from apnpql_jax.agents.heads import Heads
-from apnpql_jax.agents.modules import TwinValueHeads, ValueHead
+from apnpql_jax.agents.layers import TwinValueHeads, ValueHead
+from apnpql_jax.agents.networks import Heads
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.dists import categorical
 from apnpql_jax.types import Array, Observation, Transition
@@ -30,7 +30,7 @@ TargetPolicy = Callable[[Observation], tuple[Heads, Candidates]]
 
 
 @dataclasses.dataclass(frozen=True)
-class Evaluation(abc.ABC):
+class PolicyEvaluation(abc.ABC):
   """How values are represented and learned."""
 
   config: AgentConfig
@@ -38,7 +38,7 @@ class Evaluation(abc.ABC):
 
   @abc.abstractmethod
   def head(self, hidden: Sequence[int]) -> nn.Module:
-    """Builds the value head; see ``modules.ValueHead`` for its inputs and outputs."""
+    """Builds the value head; see ``layers.ValueHead`` for its inputs and outputs."""
 
   @abc.abstractmethod
   def value(self, outputs: Float[Array, "*b n"]) -> Float[Array, "*b"]:
@@ -59,7 +59,7 @@ class Evaluation(abc.ABC):
     return target
 
 
-class Categorical(Evaluation):
+class Categorical(PolicyEvaluation):
   """Return distributions on fixed atoms (paper Eq. 8)."""
 
   @property
@@ -97,7 +97,7 @@ class Categorical(Evaluation):
     return categorical.mean(target, self.atoms)
 
 
-class TD0(Evaluation):
+class TD0(PolicyEvaluation):
   """A scalar value, regressed on r + gamma E_pi[Q(s', a')]."""
 
   def head(self, hidden: Sequence[int]) -> nn.Module:

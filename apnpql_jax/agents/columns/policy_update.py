@@ -9,11 +9,12 @@ from __future__ import annotations
 from flax import struct
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float, PRNGKeyArray
 
 from apnpql_jax.agents import losses
 from apnpql_jax.agents.columns.candidates import Candidates
 from apnpql_jax.agents.columns.policy import non_parametric, parametric
-from apnpql_jax.agents.heads import Heads
+from apnpql_jax.agents.networks import Heads
 from apnpql_jax.dists import boltzmann
 from apnpql_jax.dists.action import ActionDistribution
 from apnpql_jax.types import Array
@@ -22,14 +23,23 @@ from apnpql_jax.types import Array
 class Improvement(struct.PyTreeNode):
   """An improved policy at ``*b`` states and the losses that train it."""
 
-  candidates: Candidates  # of q, or of pi_psi for the reverse KL
-  weights: Array  # f32[S, *b]: weights of q on the candidates; sum to one over S
-  kl: Array  # f32[*b]: KL from the policy of the candidates to the regularizer, nats
-  entropy: Array  # f32[*b]: entropy of q, or of pi_psi if there is one, nats
-  losses: dict[str, Array]  # f32[*b] each
+  candidates: Candidates
+  """Candidates of q, or of pi_psi for the reverse KL."""
+
+  weights: Float[Array, " s *b"]
+  """Weights of q on the candidates; sum to one over S."""
+
+  kl: Float[Array, "*b"]
+  """KL from the policy of the candidates to the regularizer, nats."""
+
+  entropy: Float[Array, "*b"]
+  """Entropy of q, or of pi_psi if there is one, nats."""
+
+  losses: dict[str, Float[Array, "*b"]]
+  """Losses by name."""
 
 
-def none(heads: Heads, prior: ActionDistribution, key: Array) -> Improvement:
+def none(heads: Heads, prior: ActionDistribution, key: PRNGKeyArray) -> Improvement:
   """Keeps q as the policy; trains only alpha, by the dual of its KL limit (Eq. 7)."""
   config = heads.config
   q = non_parametric(heads, prior, key, num_samples=config.policy_samples)
@@ -38,7 +48,9 @@ def none(heads: Heads, prior: ActionDistribution, key: Array) -> Improvement:
   return Improvement(q, q.weights, kl, q.entropy, {"loss/alpha": dual})
 
 
-def forward_kl(heads: Heads, prior: ActionDistribution, key: Array) -> Improvement:
+def forward_kl(
+  heads: Heads, prior: ActionDistribution, key: PRNGKeyArray
+) -> Improvement:
   """Minimizes KL(q || pi_psi) by weighted maximum likelihood (MPO, moment matching)."""
   step = none(heads, prior, key)
   q, policy = step.candidates, heads.policy()
@@ -47,7 +59,9 @@ def forward_kl(heads: Heads, prior: ActionDistribution, key: Array) -> Improveme
   return step.replace(entropy=policy.entropy_bound(), losses=terms)
 
 
-def reverse_kl(heads: Heads, prior: ActionDistribution, key: Array) -> Improvement:
+def reverse_kl(
+  heads: Heads, prior: ActionDistribution, key: PRNGKeyArray
+) -> Improvement:
   """Minimizes KL(pi_psi || q) through alpha KL(pi || b) - E_pi[Q] (SAC, mode seeking).
 
   The arm is reparameterized and the gripper summed over. With a uniform b the limit

@@ -5,15 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import jax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
 from apnpql_jax.agents import losses
 from apnpql_jax.agents.columns.candidates import Candidates
 from apnpql_jax.agents.columns.policy import parametric
-from apnpql_jax.agents.heads import Heads
+from apnpql_jax.agents.networks import Heads
 from apnpql_jax.dists.action import ActionDistribution, UniformBox
 from apnpql_jax.dists.gmm import GripperGMM
-from apnpql_jax.types import ARM_DOF, Transition
+from apnpql_jax.types import ARM_DOF, Array, Transition
 
 Losses = dict[str, Float[Array, "*b"]]
 

@@ -1,4 +1,4 @@
-"""The flax modules behind the heads (paper Fig. 2 and Sec. IV-B)."""
+"""The flax modules of the heads (paper Fig. 2 and Sec. IV-B)."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ from collections.abc import Sequence
 
 from flax import linen as nn
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+from apnpql_jax.types import Array
 
 _small = nn.initializers.variance_scaling(1e-4, "fan_in", "truncated_normal")
 
 
-class Head(nn.Module):
+class MLP(nn.Module):
   """Hidden relu layers and a linear layer that starts near zero."""
 
   hidden: Sequence[int]
@@ -26,7 +28,7 @@ class Head(nn.Module):
 
 
 class Constant(nn.Module):
-  """One trained number for all states, in place of a ``Head`` with one output."""
+  """One trained number for all states, in place of an ``MLP`` with one output."""
 
   @nn.compact
   def __call__(self, x: Float[Array, "*b n"]) -> Float[Array, "*b 1"]:

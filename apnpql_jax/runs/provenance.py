@@ -20,7 +20,7 @@ def changed_versions(run_dir: Path, *, devices: int = 1) -> list[str]:
   """Returns what changed since a run was started, such as ``jax 0.9.1 -> 0.10.2``.
 
   With other versions or another device a resumed run keeps learning, but not bit for
-  bit. If the record cannot be read, the only line says so.
+  bit. Returns one line if the record cannot be read.
   """
   from apnpql_jax.runs import leaves
 

@@ -1,4 +1,4 @@
-"""Updates that were not finite: stopping the run, and repeating one to debug it.
+"""Non-finite updates: stopping the run, and repeating one to debug it.
 
 A skipped update leaves the learner unchanged, and its batch is a function of its key.
 The saved update is therefore exactly the one that failed.
@@ -60,7 +60,7 @@ def check(config: TrainConfig, state: TrainState, run_dir: Path) -> None:
   if devices.is_primary():
     np.savez(path, **arrays)
   raise errors.RunStopped(
-    f"{skipped} updates in a row were not finite; repeat the last one with: "
+    f"{skipped} consecutive updates were non-finite; repeat the last one with: "
     f"apnpql repeat {path}",
     errors.FAILED,
   )
@@ -70,7 +70,7 @@ def repeat(path: Path) -> dict[str, list[str]]:
   """Repeats a saved update with the settings of its run.
 
   Returns:
-    Names of the arrays that are not finite in the batch, in the learner before and
+    Names of the non-finite arrays in the batch, in the learner before and
     after the update, and in the metrics.
 
   Raises:

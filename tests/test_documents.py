@@ -1,0 +1,56 @@
+"""Documents: the files, modules and tests that they name exist."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import re
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCUMENTS = sorted(
+  path
+  for pattern in ("*.md", "benchmarks/*.md", "docs/**/*.md", "experiments/**/*.md")
+  for path in ROOT.glob(pattern)
+)
+
+FOLDERS = "apnpql_jax|benchmarks|docs|experiments|mjcf|tests"
+PATH = re.compile(rf"(?<![\w./-])((?:{FOLDERS})/[\w./-]*\w|(?:\w+/)+\w+\.py)\b")
+"""A path from the root of the repository, or a script's from the package or docs."""
+
+
+def missing(text: str) -> set[str]:
+  """Returns the paths and the modules of commands in ``text`` that do not exist."""
+  paths = set(PATH.findall(text))
+  modules = re.findall(r"python -m (benchmarks\.[\w.]*\w)", text)
+  paths |= {name.replace(".", "/") + ".py" for name in modules}
+  roots = [ROOT, ROOT / "apnpql_jax", ROOT / "docs"]
+  return {path for path in paths if not any((root / path).exists() for root in roots)}
+
+
+@pytest.mark.parametrize(
+  ("text", "expected"),
+  [
+    ("see docs/none.md.", "docs/none.md"),
+    ("`tests/none/test_none.py`", "tests/none/test_none.py"),
+    ("    python benchmarks/none.py --quick", "benchmarks/none.py"),
+    ("python -m benchmarks.speed.none.", "benchmarks/speed/none.py"),
+    ("`agents/none.py: f`", "agents/none.py"),
+  ],
+)
+def test_every_form_of_a_missing_path_is_found(text, expected):
+  assert missing(text) == {expected}
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda p: str(p.relative_to(ROOT)))
+def test_files_and_commands_that_a_document_names_exist(document):
+  # The guide to adding a task names the files to make.
+  assert {x for x in missing(document.read_text()) if "touch_ball" not in x} == set()
+
+
+def test_tests_that_documents_name_exist():
+  files = {p.stem: p.read_text() for p in Path(__file__).parent.rglob("test_*.py")}
+  known = files.keys() | set(re.findall(r"def (test_\w+)\(", "".join(files.values())))
+  for document in DOCUMENTS:
+    named = set(re.findall(r"`(?:tests/[\w/]*)?(test_\w+)", document.read_text()))
+    assert named <= known, document
