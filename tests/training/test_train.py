@@ -63,7 +63,7 @@ def changed(**settings: object) -> TrainConfig:
       changed(replay=dataclasses.replace(testing.TINY.replay, demonstrations="none")),
       {},
       FileError,
-      "none is no archive",
+      "none is not an .npz archive",
     ),
     (testing.TINY, {"run_dir": "old"}, FileError, "old' holds a run"),
     (changed(seed=1), {"run_dir": "old", "resume": True}, ConfigError, "seed 0 -> 1"),
@@ -142,7 +142,7 @@ def test_evaluate_rejects_arguments_before_it_looks_for_checkpoints(
 
 def test_evaluate_has_the_defaults_of_the_command_line():
   defaults = inspect.signature(evaluate).parameters
-  for name in ("episodes", "seed", "backend", "greedy", "video"):
+  for name in ("episodes", "seed", "backend", "acting", "video"):
     assert defaults[name].default == getattr(Evaluate(), name)
 
 
