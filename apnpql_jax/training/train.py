@@ -78,20 +78,7 @@ def train(
       checkpoints are unchanged.
   """
   run_dir = Path(run_dir)
-  run_folder.check_start(
-    run_dir,
-    config,
-    resume=resume,
-    overwrite=overwrite,
-    tasks=task_names(),
-    algorithms=table_one.epsilon_bounds(),
-    memory_bytes=devices.available_memory(),
-    devices=mesh.size if mesh else 1,
-  )
-  check_sinks(config.sinks)
-  if handle_signals and threading.current_thread() is not threading.main_thread():
-    raise ConfigError("handle_signals=True works in the main thread only")
-  devices.barrier()  # All have checked the folder before the first one writes to it.
+  _check(config, run_dir, mesh, resume, overwrite, handle_signals)
   hint = f"to continue: --resume {run_dir}"
   signals = Signals(
     f"stopped before the first iteration; {hint if resume else 'nothing is saved'}"
@@ -115,6 +102,31 @@ def train(
     "updates": int(state.learner.step),
     **evaluation,
   }
+
+
+def _check(
+  config: TrainConfig,
+  run_dir: Path,
+  mesh: Mesh | None,
+  resume: bool,
+  overwrite: bool,
+  handle_signals: bool,
+) -> None:
+  """Raises ``UserError`` if the run cannot start; see ``train`` for the arguments."""
+  run_folder.check_start(
+    run_dir,
+    config,
+    resume=resume,
+    overwrite=overwrite,
+    tasks=task_names(),
+    algorithms=table_one.epsilon_bounds(),
+    memory_bytes=devices.available_memory(),
+    devices=mesh.size if mesh else 1,
+  )
+  check_sinks(config.sinks)
+  if handle_signals and threading.current_thread() is not threading.main_thread():
+    raise ConfigError("handle_signals=True works in the main thread only")
+  devices.barrier()  # All have checked the folder before the first one writes to it.
 
 
 def _run(
