@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 import contextlib
+import gc
 from importlib import metadata
 import io
 import os
@@ -22,6 +23,7 @@ MIN_THREADS = 4  # XLA:CPU threads per emulated device, which share a pool
 # Operations that XLA:CPU runs in the library YNNPACK; its default adds "REDUCE".
 KEPT_FUSIONS = "INDIVIDUAL_CONVOLUTION", "INDIVIDUAL_DOT"
 # The flag and the jaxlib versions that have it; XLA aborts on unknown flags.
+_JAX_DEFAULTS = None, 1.0  # of the settings below
 _FLAG, _FLAG_VERSIONS = "xla_cpu_experimental_ynn_fusion_type", r"0\.1[01]\."
 
 
@@ -33,15 +35,17 @@ def configure() -> None:
   """
   wanted = _threads() | _fusions()
   changed = {k: value for k, value in wanted.items() if os.environ.get(k) != value}
-  defaults = {
+  settings = {
     "jax_compilation_cache_dir": str(cache_dir() / "xla"),
+    # Below JAX's default are programs that together delay each start by a second.
+    "jax_persistent_cache_min_compile_time_secs": 0.2,
     # By default XLA multiplies f32 matrices in TF32 (10 bits of mantissa) on GPUs. Mass
     # matrices, forward kinematics and so contacts would lose three digits.
     "jax_default_matmul_precision": "highest",
   }
   jax: Any = sys.modules.get("jax")
   bridge: Any = sys.modules.get("jax._src.xla_bridge")
-  unset = [name for name in defaults if jax and getattr(jax.config, name, None) is None]
+  unset = [k for k in settings if jax and getattr(jax.config, k, None) in _JAX_DEFAULTS]
   if (changed or unset) and bridge and bridge.backends_are_initialized():
     names = ", ".join((*changed, *(name.upper() for name in unset)))
     raise UserError(
@@ -49,10 +53,19 @@ def configure() -> None:
       "call configure() first"
     )
   os.environ.update(changed)
-  for name, value in defaults.items():
-    os.environ.setdefault(name.upper(), value)
+  for name, value in settings.items():
+    os.environ.setdefault(name.upper(), str(value))
     if name in unset:
-      jax.config.update(name, os.environ[name.upper()])
+      jax.config.update(name, type(value)(os.environ[name.upper()]))
+
+
+def collect_garbage_less_often() -> None:
+  """Lets Python's garbage collector pass over what the imports made, and run less.
+
+  Tracing allocates so many objects that a tenth of a run's start is its work.
+  """
+  gc.freeze()
+  gc.set_threshold(50_000, 20, 20)
 
 
 def cache_dir() -> Path:

@@ -28,6 +28,11 @@ os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {testing.XLA_FLAGS
 runtime.configure()
 
 
+def pytest_collection_finish() -> None:
+  """Saves a quarter of the tests' time."""
+  runtime.collect_garbage_less_often()
+
+
 @pytest.fixture(scope="module", autouse=True)
 def few_programs() -> Iterator[None]:
   """Frees compiled programs before Linux's 65,530 memory maps of a process run out.
@@ -73,7 +78,7 @@ def draw(task: Task) -> ResetDraw:
 @pytest.fixture(scope="module")
 def kinematics(task: Task, resets: physics.PhysicsState) -> Kinematics:
   """Returns the kinematics of the initial states, with the arm high over the table."""
-  return jax.jit(make_kinematics(task.scene))(resets)
+  return make_kinematics(task.scene)(resets)
 
 
 @pytest.fixture(scope="module")

@@ -18,6 +18,7 @@ NAMES = (
   "PJRT_NPROC",
   "JAX_COMPILATION_CACHE_DIR",
   "JAX_DEFAULT_MATMUL_PRECISION",
+  "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS",
   "XLA_FLAGS",
 )
 CONFIGURE = "import apnpql_jax; apnpql_jax.configure()"
@@ -90,6 +91,7 @@ def test_settings_of_the_user_are_kept(tmp_path):
   given = {
     "JAX_COMPILATION_CACHE_DIR": str(tmp_path),
     "JAX_DEFAULT_MATMUL_PRECISION": "float32",
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "3",
     "NPROC": "6",
     "XLA_FLAGS": runtime.fusions_flag("INDIVIDUAL_DOT", "REDUCE"),
   }
@@ -133,10 +135,12 @@ def test_cache_is_in_the_cache_folder_of_the_user(tmp_path):
 def test_jax_has_the_settings_whichever_is_imported_first(order, tmp_path):
   code = (
     f"{order}; c = jax.config;"
-    "print(c.jax_compilation_cache_dir, c.jax_default_matmul_precision)"
+    "print(c.jax_compilation_cache_dir, c.jax_persistent_cache_min_compile_time_secs,"
+    " c.jax_default_matmul_precision)"
   )
   cache = tmp_path / "apnpql_jax" / "xla"
-  assert run(code, XDG_CACHE_HOME=str(tmp_path)).split() == [str(cache), "highest"]
+  shown = run(code, XDG_CACHE_HOME=str(tmp_path)).split()
+  assert shown == [str(cache), "0.2", "highest"]
 
 
 @pytest.mark.parametrize("also", ["", f"{CONFIGURE};"], ids=["late", "again"])

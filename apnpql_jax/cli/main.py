@@ -28,6 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
   130 Ctrl-C and 143 SIGTERM, with the run saved. All but 0 print one line to stderr.
   """
   runtime.configure()
+  runtime.collect_garbage_less_often()
   args = list(sys.argv[1:] if argv is None else argv)
   try:
     if not args:

@@ -161,7 +161,7 @@ def _solve_targets(
   report: BankReport,
   advance: Callable[[int], None],
 ) -> ResetBank:
-  kinematics = jax.jit(make_kinematics(task.scene))(state)
+  kinematics = make_kinematics(task.scene)(state)
   positions, rotations, _ = map(np.asarray, task.tool_targets(state, kinematics))
   starts = np.asarray(state.qpos[:, task.scene.arm_qpos])
   arrays = starts, positions, rotations

@@ -43,4 +43,5 @@ def make_kinematics(scene: Scene) -> Callable[[PhysicsState], Kinematics]:
     data = mjx.camlight(world, mjx.kinematics(world, data))
     return Kinematics(**{k: getattr(data, k) for k in _POSES}, fields=state.fields)
 
-  return jax.vmap(kinematics)
+  # Jitted, so that all programs of a process share one trace, which takes a second.
+  return jax.jit(jax.vmap(kinematics))

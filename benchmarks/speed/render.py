@@ -117,7 +117,7 @@ def make_pair(
 def make_poses(scene: Scene, batch: int) -> Kinematics:
   """Draws reset states of the scene and returns their poses [batch, ...]."""
   draw = make_task(scene.name).sample_resets(np.random.default_rng(0), batch)
-  return jax.jit(make_kinematics(scene))(initial_state(scene, *map(jnp.asarray, draw)))
+  return make_kinematics(scene)(initial_state(scene, *map(jnp.asarray, draw)))
 
 
 if __name__ == "__main__":

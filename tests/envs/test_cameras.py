@@ -25,7 +25,7 @@ def test_the_whole_hand_casts_a_shadow(name):
 
 def test_the_shadow_falls_only_on_the_table_and_flat_marks(task, resets):
   scene = task.scene
-  poses = jax.jit(make_kinematics(scene))(resets)
+  poses = make_kinematics(scene)(resets)
   plain, shaded = (
     np.asarray(make_cameras(EnvConfig(shadows=shadows), scene)[0](poses), np.int32)
     for shadows in (False, True)

@@ -134,7 +134,7 @@ def test_every_reset_draws_a_shape_without_recompilation(env):
 
 
 def test_each_world_is_rendered_with_its_own_shape(task, models, state):
-  kinematics = jax.jit(make_kinematics(task.scene))(state)
+  kinematics = make_kinematics(task.scene)(state)
   size = (72, 96)
   image = segmentation(task.scene, kinematics, size)
   for world in range(WORLDS):

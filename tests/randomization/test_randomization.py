@@ -83,7 +83,7 @@ def drawn(task) -> physics.PhysicsState:
 
 
 def _kinematics(task):
-  return jax.jit(make_kinematics(task.scene))
+  return make_kinematics(task.scene)
 
 
 def _bits(tree) -> list[bytes]:

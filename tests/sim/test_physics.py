@@ -127,7 +127,7 @@ def test_arm_commanded_into_the_table_stays_finite(engines, resets, task, name: 
     state = engines[name](state, down, jnp.zeros(down.shape[0]))
     assert np.isfinite(state.qpos).all() and np.isfinite(state.qvel).all()
   assert np.abs(state.qvel[:, :6]).max() < 3.0
-  kinematics = jax.jit(make_kinematics(scene))(state)
+  kinematics = make_kinematics(scene)(state)
   tips = kinematics.geom_xpos[
     :, [scene.id("geom", g) for g in ("r_tip", "l_tip", "hand")], 2
   ]
@@ -154,7 +154,7 @@ def test_gripper_closes_at_its_speed(engines, resets, task, name: str):
 def test_kinematics_agree_with_mujoco(task, resets):
   """All poses equal those of C MuJoCo."""
   scene = task.scene
-  kinematics = jax.jit(make_kinematics(scene))(resets)
+  kinematics = make_kinematics(scene)(resets)
   data = mujoco.MjData(scene.model)
   for i in range(4):
     data.qpos[:] = resets.qpos[i]

@@ -119,7 +119,7 @@ def test_resets_are_uniform_in_range(task, draw):
 
 
 def test_the_small_image_shows_which_way_up_the_cup_is(task, resets, solved):
-  forward, mouth = jax.jit(make_kinematics(task.scene)), task.scene.id("geom", "mouth")
+  forward, mouth = make_kinematics(task.scene), task.scene.id("geom", "mouth")
   down, up = (
     (segmentation(task.scene, forward(state)) == mouth).sum((1, 2))
     for state in (resets, solved)

@@ -115,7 +115,7 @@ def pinch(scene) -> Pinch:
 
 @pytest.fixture(scope="module")
 def forward(scene):
-  return jax.jit(make_kinematics(scene))
+  return make_kinematics(scene)
 
 
 @pytest.fixture(scope="module")
