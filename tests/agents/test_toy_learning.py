@@ -232,22 +232,26 @@ def learn(config: AgentConfig, iterations: int, *, held: bool = False):
 
 
 def test_agent_learns_to_carry_the_object_to_the_goal():
-  before, after, metrics = learn(CONFIG, 700)
+  before, after, metrics = learn(CONFIG, 550)
   assert before < 0.1
   assert after > 0.9
   # The KL limit is active, so the primitives alone do not explain the success.
   assert jnp.mean(metrics["npql/kl_over_eps"][-50:]) > 0.7
 
 
-SLOW = [("abm_mpo", 1.5), ("svg_prior", 6.0), ("mpo", 1.5), ("ap_cem", 1.5)]
+SLOW = [
+  ("ap_mpo", 1.5),
+  ("ap_sac", 6.0),
+  ("abm_mpo", 1.5),
+  ("svg_prior", 6.0),
+  ("mpo", 1.5),
+  ("ap_cem", 1.5),
+]
 
 
 @pytest.mark.parametrize(
   ("algorithm", "epsilon"),
-  [
-    *[("ap_mpo", 1.5), ("ap_sac", 6.0), ("sac", 8.0)],
-    *(pytest.param(*row, marks=pytest.mark.slow) for row in SLOW),
-  ],
+  [("sac", 8.0), *(pytest.param(*row, marks=pytest.mark.slow) for row in SLOW)],
 )
 def test_every_algorithm_of_the_paper_learns_half_of_the_task(algorithm, epsilon):
   """The object starts in the hand; the agent must hold it and reach the goal."""
