@@ -33,9 +33,7 @@ def test_bank_targets_reach_their_poses(task, small_bank):
   assert report.max_position_residual < ik.POSITION_TOLERANCE
   assert report.max_rotation_residual < ik.ROTATION_TOLERANCE
   state = _at(task, rows)
-  positions, rotations, _ = task.tool_targets(
-    state, make_kinematics(task.scene)(state)
-  )
+  positions, rotations, _ = task.tool_targets(state, make_kinematics(task.scene)(state))
   reached, turned, _ = arm.forward(arm.make_chain(task.scene), rows.targets)
   np.testing.assert_allclose(reached, positions, atol=1e-3)
   angle = np.linalg.norm(arm.rotation_error(turned, rotations), axis=-1)

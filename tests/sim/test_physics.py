@@ -54,6 +54,19 @@ def test_engines_agree(random_play, task):
   np.testing.assert_allclose(native.time, mjx.time, rtol=1e-5)
 
 
+def test_a_step_starts_from_its_state_alone(engines, resets):
+  """C MuJoCo keeps the solver's warm start and more in its data between two steps."""
+  worlds = len(resets.qpos)
+  still, down = jnp.zeros(worlds), jnp.zeros((worlds, 6)).at[:, 1].set(1.0)
+  low = play(engines["native"], resets, [down] * 12, [still] * 12)
+  state = jax.tree.map(lambda x: jnp.asarray(x[-1]), low)
+  first = engines["native"](state, down, still)
+  engines["native"](resets, -down, still + 1.0)
+  again = engines["native"](state, down, still)
+  for one, other in zip(*map(jax.tree.leaves, (first, again)), strict=True):
+    np.testing.assert_array_equal(one, other)
+
+
 @pytest.mark.parametrize("name", ENGINES)
 def test_a_sliding_plate_stops_by_coulomb_friction(engines, task, resets, name: str):
   """It slides v^2 / (2 mu g) in both engines, with the friction of the MJCF."""

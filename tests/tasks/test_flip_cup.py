@@ -16,7 +16,6 @@ from hand_made import (
   tool_at,
   with_gap,
 )
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
