@@ -67,8 +67,8 @@ class Env:
     self._kinematics = make_kinematics(scene)
     self._cameras = make_cameras(config, scene)
     # Traced once per number of worlds; compiled when called outside jit.
+    self.begin, self.advance = jax.jit(self.begin), jax.jit(self.advance)
     self._observe = devices.per_device(jax.jit(self._judge_and_observe), mesh)
-    self._reset = jax.jit(lambda rows: self.observe(self.begin(rows)))
     self._randomize = (
       make_randomize(config.randomization, scene) if config.randomize else None
     )
@@ -91,7 +91,7 @@ class Env:
 
   def reset(self, rows: Int[Array, " worlds"]) -> EnvState:
     """Starts one world per bank row; a row always has the same randomization."""
-    return self._reset(rows)
+    return self.observe(self.begin(rows))
 
   def step(
     self, state: EnvState, action: Float[Array, "worlds 7"], key: PRNGKeyArray

@@ -52,9 +52,10 @@ def absurd_batch(rows: Transition, key: Array) -> Transition:
 def _cases() -> list[Any]:
   """Returns rows, whether they see images, and numbers of updates.
 
-  All rows have the same encoder, so one of them sees images.
+  All rows have the same encoder, so one of them sees images. The three together have
+  every kind of policy and evaluation.
   """
-  cases = [(name, name == "ap_npql", 100) for name in ALGORITHMS]
+  cases = [("ap_npql", True, 100), ("svg_prior", False, 100), ("ap_cem", False, 100)]
   slow = [(name, True, 1000) for name in ALGORITHMS]
   return cases + [pytest.param(*case, marks=pytest.mark.slow) for case in slow]
 

@@ -72,7 +72,7 @@ def test_the_replay_is_what_the_worlds_showed(demos, env):
   begin = np.flatnonzero(demos.first)
   rows = jax.random.split(jax.random.key(0))[0]
   rows = jax.random.randint(rows, (EPISODES,), 0, env.bank_split)
-  state, step = env.reset(rows), jax.jit(env.step)
+  state, step = env.reset(rows), env.step
   index = np.resize(np.arange(demos.instants), (worlds, length)).T
   for t in range(STEPS + 1):
     seen = jax.tree.map(np.asarray, state.timestep)

@@ -14,12 +14,13 @@ import pytest
 from apnpql_jax.config.ranges import RandomizationConfig
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.envs.env import Env, make_env
+from apnpql_jax.envs.state import EnvState
 from apnpql_jax.randomization.draw import free_bodies
 from apnpql_jax.randomization.randomize import make_randomize
 from apnpql_jax.sim import arm, engines, physics
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.tasks import make_task, task_names
-from apnpql_jax.training.rollout import FILMED, expert_policy, make_player, rollout
+from apnpql_jax.training.rollout import FILMED, expert_policy, make_player
 
 WORLDS = 8
 ALL = RandomizationConfig()
@@ -295,14 +296,12 @@ def plain_env() -> Env:
   return make_env(CONFIG)
 
 
-def _episodes(env: Env):
+def _episodes(env: Env, *, seed: int = 0) -> EnvState:
   """Plays two episodes of three periods and the first instant of a third."""
-  play = jax.jit(
-    lambda rows, key: rollout(
-      env, expert_policy(env, noise=0.1), env.reset(rows), key, length=9
-    )
-  )
-  return play(jnp.arange(4), jax.random.key(0))
+  states = [env.reset(jnp.arange(4))]
+  for key in jax.random.split(jax.random.key(seed), 8):
+    states.append(env.step(states[-1], env.expert_action(states[-1]), key))
+  return jax.tree.map(lambda *x: np.stack(x), *states)
 
 
 def test_zero_ranges_equal_no_randomization(plain_env):
@@ -335,23 +334,15 @@ def test_each_episode_has_its_own_world(plain_env):
   env = Env(
     dataclasses.replace(CONFIG, randomize=True), plain_env.task, plain_env._bank
   )
-
-  @jax.jit
-  def play(rows, key):
-    def period(state, key):
-      action = env.expert_action(state)
-      return env.step(state, action, key), (state.physics.fields, state.timestep)
-
-    return jax.lax.scan(period, env.reset(rows), jax.random.split(key, 9))[1]
-
-  fields, timestep = play(jnp.arange(4), jax.random.key(0))
+  states = _episodes(env)
+  fields = states.physics.fields
   for name in ("body_mass", "geom_rgba", "gripper_speed", "cam_pos"):
     value = np.asarray(fields[name]).reshape(9, 4, -1)
     same = (value[1:] == value[:-1]).all(-1)
     # The instants 0 to 3 are one episode, 4 to 7 the next.
     np.testing.assert_array_equal(same[[0, 1, 2, 4, 5, 6]], True)
     np.testing.assert_array_equal(same[[3, 7]], False)
-  again, _ = play(jnp.arange(4), jax.random.key(1))
+  again = _episodes(env, seed=1).physics.fields
   assert _bits(jax.tree.map(lambda x: x[0], again)) == _bits(
     jax.tree.map(lambda x: x[0], fields)
   )
@@ -359,6 +350,7 @@ def test_each_episode_has_its_own_world(plain_env):
     jax.tree.map(lambda x: x[4], fields)
   )
   # The reported tool position assumes the table of the scene file.
-  joints = timestep.observation.robot[..., -7:-1]
+  observation = states.timestep.observation
+  joints = observation.robot[..., -7:-1]
   position, _, _ = arm.forward(arm.make_chain(env.task.scene), joints)
-  np.testing.assert_allclose(timestep.observation.tool, position, atol=1e-5)
+  np.testing.assert_allclose(np.asarray(observation.tool), position, atol=1e-5)

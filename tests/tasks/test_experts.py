@@ -16,6 +16,7 @@ from apnpql_jax.envs.state import EnvState
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.tasks import task_names
 from apnpql_jax.training.rollout import expert_policy
+from apnpql_jax.types import Array
 
 ROWS = 128
 WORLDS = 16
@@ -50,9 +51,11 @@ def env(request) -> Env:
 @pytest.fixture(scope="module")
 def step(env) -> Step:
   @jax.jit
+  def act(state: EnvState, key: PRNGKeyArray, noise: float) -> Array:
+    return expert_policy(env, noise=noise)(state, key)[0]
+
   def step(state: EnvState, key: PRNGKeyArray, noise: float) -> EnvState:
-    action, _ = expert_policy(env, noise=noise)(state, jax.random.fold_in(key, 1))
-    return env.step(state, action, key)
+    return env.step(state, act(state, jax.random.fold_in(key, 1), noise), key)
 
   return step
 

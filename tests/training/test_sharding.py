@@ -135,7 +135,8 @@ def _split(state: TrainState) -> list[str]:
   return sorted(part for part, split in parts.items() if split == {True})
 
 
-@pytest.mark.parametrize("resumed", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("resumed", [False, True])
 def test_two_processes_learn_what_one_learns_and_stop_together(tmp_path, resumed):
   run, single = tmp_path / "run", tmp_path / "single"
   logs = [tmp_path / "first", tmp_path / "second", tmp_path / "single.log"]

@@ -15,25 +15,19 @@ import pytest
 
 from apnpql_jax import testing
 from apnpql_jax.cli.options import Evaluate
-from apnpql_jax.config.schema import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
+from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import ConfigError, FileError, UserError
 from apnpql_jax.runs import checkpoint_reader, run_folder
 from apnpql_jax.training.evaluate import evaluate
 from apnpql_jax.training.train import train
 from apnpql_jax.training.video import HOLD
 
-CONFIG = TrainConfig(
-  env=EnvConfig(worlds=4, bank_rows=256, time_limit_s=0.75, backend="native"),
-  agent=AgentConfig(
-    hidden=(32, 32), feature_dim=32, target_samples=16, policy_samples=16
-  ),
-  replay=ReplayConfig(capacity=256, expert_steps=128, expert_share=0.5, batch_size=16),
-  total_steps=64,
-  rollout_length=4,
-  updates_per_iteration=2,
+CONFIG = dataclasses.replace(
+  testing.TINY,
+  env=dataclasses.replace(testing.TINY.env, time_limit_s=0.75),
   eval_every=32,
-  eval_episodes=4,
   checkpoint_every=32,
+  video=True,
 )
 
 
@@ -43,11 +37,17 @@ def in_thread(function: Callable[[], dict]) -> dict:
     return pool.submit(function).result()
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory) -> tuple[Path, dict]:
+@pytest.fixture(
+  scope="module", params=["state", pytest.param("pixels", marks=pytest.mark.slow)]
+)
+def finished(request, tmp_path_factory) -> tuple[Path, dict]:
   """Returns the folder of a finished run and the result of ``train``."""
   run_dir = tmp_path_factory.mktemp("runs") / "run"
-  return run_dir, in_thread(lambda: train(CONFIG, str(run_dir)))
+  env = dataclasses.replace(CONFIG.env, obs=request.param)
+  config = dataclasses.replace(CONFIG, env=env)
+  summary = in_thread(lambda: train(config, str(run_dir)))
+  assert run_folder.open_run(run_dir).config == config
+  return run_dir, summary
 
 
 def changed(**settings: object) -> TrainConfig:
@@ -89,14 +89,13 @@ def test_only_the_main_thread_can_be_asked_to_handle_signals(tmp_path):
 
 def test_a_run_writes_all_its_files(finished):
   run_dir, summary = finished
-  assert summary["env_steps"] == 64 and summary["updates"] == 8
+  assert summary["env_steps"] == 64 and summary["updates"] == 16
   assert summary["episodes"] == 4
-  assert run_folder.open_run(run_dir).config == CONFIG
   versions = json.loads((run_dir / "versions.json").read_text())
   assert versions["packages"]["mujoco"] == "3.17.0"
   lines = (run_dir / "metrics.jsonl").read_text().splitlines()
   rows = [json.loads(line) for line in lines]
-  assert [row["step"] for row in rows if "loss/q" in row] == [16, 32, 48, 64]
+  assert [row["step"] for row in rows if "loss/q" in row] == [*range(8, 72, 8)]
   assert [row["step"] for row in rows if "eval/success_rate" in row] == [32, 64]
   losses = [row["loss/q"] for row in rows if "loss/q" in row]
   assert np.isfinite(losses).all()
@@ -148,18 +147,20 @@ def test_evaluate_has_the_defaults_of_the_command_line():
 
 def test_resume_continues_the_run(finished):
   run_dir, _ = finished
-  longer = dataclasses.replace(CONFIG, total_steps=96, video=False)
+  config = run_folder.open_run(run_dir).config
+  longer = dataclasses.replace(config, total_steps=96, video=False)
   summary = train(longer, run_dir, resume=True)
-  assert summary["env_steps"] == 96 and summary["updates"] == 12
+  assert summary["env_steps"] == 96 and summary["updates"] == 24
   rows = (run_dir / "metrics.jsonl").read_text().splitlines()
   steps = [json.loads(row)["step"] for row in rows if "loss/q" in row]
-  assert steps == [16, 32, 48, 64, 80, 96]
+  assert steps == [*range(8, 104, 8)]
 
 
 def test_resume_rejects_other_settings(finished):
   run_dir, _ = finished
+  config = run_folder.open_run(run_dir).config
   other = dataclasses.replace(
-    CONFIG, agent=dataclasses.replace(CONFIG.agent, gamma=0.9)
+    config, agent=dataclasses.replace(config.agent, gamma=0.9)
   )
   with pytest.raises(UserError, match=r"agent\.gamma 0\.99 -> 0\.9"):
     train(other, run_dir, resume=True)
