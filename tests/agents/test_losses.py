@@ -165,13 +165,14 @@ def test_m_step_moves_the_prior_toward_the_policy():
   distance = jnp.linalg.norm(samples[..., :6] - prior.loc[None, :, 1], axis=-1)
   weights = boltzmann.importance_weights(-distance, jnp.full((1,), 0.1))
 
+  @jax.jit
   def loss(logits: jax.Array) -> jax.Array:
     moved = prior.replace(logits=logits)
     return losses.m_step_loss(moved, samples, weights, jnp.zeros(()))[0]
 
-  logits = prior.logits
+  logits, slope = prior.logits, jax.jit(jax.grad(loss))
   for _ in range(50):
-    logits = logits - jax.grad(loss)(logits)
+    logits = logits - slope(logits)
   assert loss(logits) < loss(prior.logits)
   assert jax.nn.softmax(logits)[0, 1] > 0.8
 

@@ -74,26 +74,22 @@ def dicts(tree: Any) -> Iterator[dict[str, Any]]:
       yield from dicts(value)
 
 
-def slow(*values: Any) -> Any:
-  return pytest.param(*values, marks=pytest.mark.slow)
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize(
   ("name", "args"),
   [
-    ("growth", ["--axes", "slots"]),
-    slow("growth", []),
-    slow("render", ["--alone"]),
-    slow("ray_layouts", []),
-    slow("learner", []),
-    slow("learner", ["--lstm-instants", "2", "--phi", "once"]),
-    slow("encoder_layouts", []),
-    slow("env_steps", []),
-    slow("env_steps", ["--obs", "state"]),
-    slow("end_to_end", []),
-    slow("compile_time", []),
-    slow("engines", ["--variants", "barrier and cones", "Warp"]),
-    slow("fidelity", []),
+    ("growth", []),
+    ("render", ["--alone"]),
+    ("ray_layouts", []),
+    ("learner", []),
+    ("learner", ["--lstm-instants", "2", "--phi", "once"]),
+    ("encoder_layouts", []),
+    ("env_steps", []),
+    ("env_steps", ["--obs", "state"]),
+    ("end_to_end", []),
+    ("compile_time", []),
+    ("engines", ["--variants", "barrier and cones", "Warp"]),
+    ("fidelity", []),
   ],
 )
 def test_a_benchmark_reports_its_figures(name, args):

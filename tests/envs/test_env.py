@@ -26,7 +26,7 @@ from apnpql_jax.training.rollout import (
   make_player,
   rollout,
 )
-from apnpql_jax.types import Observation
+from apnpql_jax.types import Observation, TimeStep
 
 CONFIG = EnvConfig(obs="state", backend="native", worlds=16, bank_rows=256)
 SHORT = dataclasses.replace(CONFIG, time_limit_s=0.45)
@@ -38,15 +38,13 @@ def env() -> Env:
 
 
 @pytest.fixture(scope="module")
-def pixel_chunk(env):
+def pixel_chunk(env) -> TimeStep:
   """Twelve periods of the expert in four worlds, with images of both cameras."""
   pixels = Env(dataclasses.replace(CONFIG, obs="pixels"), env.task, env._bank)
-  play = jax.jit(
-    lambda start, key: rollout(
-      pixels, expert_policy(pixels, noise=0.0), start, key, length=12
-    )
-  )
-  return play(pixels.reset(jnp.arange(4)), jax.random.key(0))[1]
+  states = [pixels.reset(jnp.arange(4))]
+  for key in jax.random.split(jax.random.key(0), 11):
+    states.append(pixels.step(states[-1], pixels.expert_action(states[-1]), key))
+  return jax.tree.map(lambda *x: np.stack(x), *(state.timestep for state in states))
 
 
 @pytest.mark.parametrize(
@@ -227,7 +225,7 @@ def test_the_observed_tool_is_where_the_joints_put_it(env):
 
 def test_pixels_show_the_task(env, pixel_chunk):
   """Plate and goal appear in their colors, at the right size, and motion is visible."""
-  observation = pixel_chunk.timestep.observation
+  observation = pixel_chunk.observation
   assert observation.global_image.shape == (12, 4, 72, 96, 3)
   assert observation.wrist_image.shape == (12, 4, 36, 64, 3)
   assert observation.global_image.dtype == observation.wrist_image.dtype == np.uint8

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hand_made import SLOW_MJX
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -109,7 +110,7 @@ def test_following_scales_all_joints_by_one_factor():
   np.testing.assert_allclose(near, tracking.GAIN * 0.01, rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["native", "mjx"])
+@pytest.mark.parametrize("name", SLOW_MJX)
 def test_following_reaches_a_target_without_overshoot(engines, resets, task, name):
   """Start, at rest, and target are random configurations near the workspace."""
   scene, step = task.scene, engines[name]

@@ -82,6 +82,8 @@ def solved(instants: Iterator[EnvState]) -> int:
   for state in instants:
     done |= ~over & np.asarray(state.timestep.terminated)
     over |= np.asarray(state.timestep.last)
+    if over.all():
+      break
   return done.sum()
 
 
