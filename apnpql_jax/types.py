@@ -21,7 +21,8 @@ Metrics = dict[str, jax.Array]
 
 ARM_DOF = 6  # joints of the UR5e
 ACTION_DIM = ARM_DOF + 1  # joint velocities in [-1, 1] rad/s, gripper (1 closes)
-NUM_PRIMITIVES = 3  # object, goal, neutral configuration (paper Sec. V-A)
+PRIMITIVES = ("object", "goal", "neutral")  # paper Sec. V-A
+NUM_PRIMITIVES = len(PRIMITIVES)
 
 
 class Observation(struct.PyTreeNode):

@@ -10,7 +10,15 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apnpql_jax.cli.options import Collect, Convert, Evaluate, List, Repeat, Train
+from apnpql_jax.cli.options import (
+  Collect,
+  Convert,
+  Diagnose,
+  Evaluate,
+  List,
+  Repeat,
+  Train,
+)
 from apnpql_jax.config import files
 from apnpql_jax.config.checks import BACKENDS
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
@@ -74,6 +82,23 @@ def evaluate(args: Evaluate) -> Json:
     step=_checkpoint_step(args),
     acting=args.acting,
     video=args.video,
+  )
+
+
+def diagnose(args: Diagnose) -> Json:
+  """Reports what limits the success of a trained agent."""
+  if not args.run:
+    raise ConfigError("diagnose needs a run folder: apnpql diagnose RUN")
+  run_folder.load_run_config(Path(args.run), print_line)
+
+  from apnpql_jax.training.diagnose import diagnose as diagnose_run
+
+  return diagnose_run(
+    Path(args.run),
+    episodes=args.episodes,
+    seed=args.seed,
+    backend=args.backend,
+    step=_checkpoint_step(args),
   )
 
 
@@ -177,7 +202,7 @@ def _task_env(task: str) -> EnvConfig:
   return dataclasses.replace(env, task=task)
 
 
-def _checkpoint_step(args: Evaluate) -> int | None:
+def _checkpoint_step(args: Evaluate | Diagnose) -> int | None:
   """Returns the step of the checkpoint asked for; None for the newest."""
   if args.checkpoint == "newest":
     return None

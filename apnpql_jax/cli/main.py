@@ -110,18 +110,33 @@ def _plain(value: Any) -> Any:
 
 def _show(result: Json) -> str:
   """Returns the result as one line per entry, for people."""
-  width = max(map(len, result))
-  return "\n".join(f"{name:<{width}}  {_text(x)}" for name, x in result.items())
+  rows = dict(_rows(result))
+  width = max(map(len, rows))
+  return "\n".join(f"{name:<{width}}  {_text(x)}" for name, x in rows.items())
+
+
+def _rows(result: Json) -> Generator[tuple[str, Any], None, None]:
+  """Yields names and values; a dict of dicts or lists has one row for each."""
+  for name, value in result.items():
+    parts = value.values() if isinstance(value, dict) else ()
+    if any(isinstance(part, dict | list) for part in parts):
+      yield from ((f"{name} {key}", part) for key, part in value.items())
+    else:
+      yield name, value
 
 
 def _text(value: Any) -> str:
-  if isinstance(value, dict):  # A contact report.
-    value = [
-      f"{number:,.0f} {name.replace('_', ' ')}" for name, number in value.items()
-    ]
+  if isinstance(value, dict):
+    value = [f"{_number(x)} {name.replace('_', ' ')}" for name, x in value.items()]
   if isinstance(value, list):
-    return ", ".join(value) or "none"
+    return ", ".join(map(_number, value)) or "none"
   return str(value)
+
+
+def _number(value: Any) -> str:
+  if isinstance(value, float):
+    return f"{value:.3g}"
+  return f"{value:,}" if isinstance(value, int) else str(value)
 
 
 def _help() -> str:
@@ -135,6 +150,7 @@ def _help() -> str:
 _COMMANDS: dict[str, tuple[type[Any], Callable[[Any], Json]]] = {
   "train": (Train, commands.train),
   "evaluate": (options.Evaluate, commands.evaluate),
+  "diagnose": (options.Diagnose, commands.diagnose),
   "collect": (options.Collect, commands.collect),
   "convert": (options.Convert, commands.convert),
   "repeat": (options.Repeat, commands.repeat),

@@ -113,6 +113,26 @@ class Evaluate(_Play):
 
 
 @dataclasses.dataclass(frozen=True)
+class Diagnose(_Command):
+  """Reports where and why an agent fails: apnpql diagnose RUN [options]."""
+
+  run: tyro.conf.Positional[str] = ""
+  """Run folder."""
+
+  checkpoint: str = "newest"
+  """Checkpoint: newest, best (highest success rate in training) or its step."""
+
+  episodes: int = 64
+  """Number of episodes of each acting rule."""
+
+  seed: int = 0
+  """Random seed of the episodes and of the policy."""
+
+  backend: Annotated[str | None, _default_hint("(default: as in training)")] = None
+  """Physics engine: auto, mjx or native."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Collect(_Play):
   """Plays episodes with the scripted expert: apnpql collect TASK [options]."""
 

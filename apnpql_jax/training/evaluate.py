@@ -7,16 +7,17 @@ import math
 import os
 from pathlib import Path
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
 import numpy as np
 
 from apnpql_jax import devices
-from apnpql_jax.agents.learner import make_agent
+from apnpql_jax.agents.learner import Agent, LearnerState, make_agent
 from apnpql_jax.config.checks import ACTING, check_env
-from apnpql_jax.config.schema import EnvConfig
+from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs import checkpoint_reader, leaves, run_folder
@@ -30,6 +31,7 @@ from apnpql_jax.training.rollout import (
   make_player,
 )
 from apnpql_jax.training.video import record_episodes
+from apnpql_jax.types import Array
 
 MAX_WORLDS = 64
 """Episodes played in parallel; more are played in batches."""
@@ -45,21 +47,30 @@ def play_held_out(
   Returns:
     The episodes, with the states of the first of them.
   """
+  batches = held_out_batches(env, episodes=episodes, seed=seed)
+  played = [play(params, rows, key) for rows, key in batches]
+  success = np.concatenate([p.success for p in played])[:episodes]
+  length = np.concatenate([p.length for p in played])[:episodes]
+  return played[0].replace(success=success, length=length)
+
+
+def held_out_batches(
+  env: Env, *, episodes: int, seed: int
+) -> list[tuple[Array, PRNGKeyArray]]:
+  """Returns rows of the bank i32[worlds] and keys of batches of ``play_held_out``.
+
+  The last batch is padded, so that all have one compiled size.
+  """
   key = jax.random.key(seed)
   rng = np.random.default_rng(seed)
   orders = [rng.permutation(env.held_out) for _ in range(-(-episodes // env.held_out))]
   rows = env.bank_split + np.concatenate(orders)[:episodes]
   batches = math.ceil(episodes / MAX_WORLDS)
   size = math.ceil(episodes / batches)
-  # The last batch is padded, so that all have one compiled size.
   padded = np.resize(rows, batches * size).reshape(batches, size)
-  played = [
-    play(params, jnp.asarray(batch), jax.random.fold_in(key, i))
-    for i, batch in enumerate(padded)
+  return [
+    (jnp.asarray(batch), jax.random.fold_in(key, i)) for i, batch in enumerate(padded)
   ]
-  success = np.concatenate([p.success for p in played])[:episodes]
-  length = np.concatenate([p.length for p in played])[:episodes]
-  return played[0].replace(success=success, length=length)
 
 
 def figures_of(played: Episodes) -> dict[str, Any]:
@@ -103,13 +114,38 @@ def evaluate(
     ConfigError: An argument is invalid; nothing was built.
     FileError: Not a run folder, or no readable checkpoint.
   """
-  began, run_dir = time.monotonic(), Path(run_dir)
-  video = _check(episodes, seed, video)
+  began, video = time.monotonic(), _check(episodes, seed, video)
+  if acting is not None:
+    check_name("acting", acting, ACTING)
+  config, env, agent, learner, step = load_trained(run_dir, backend=backend, step=step)
+  acting = acting or config.eval_acting
+  play = make_player(env, lambda params: agent_policy(agent, params, acting=acting))
+  played = play_held_out(env, play, learner.target_params, episodes=episodes, seed=seed)
+  about = {"algorithm": config.agent.algorithm, "acting": acting}
+  return _summary(env, played, about, step, began, video)
+
+
+class Trained(NamedTuple):
+  """What a checkpoint needs to act."""
+
+  config: TrainConfig
+  env: Env
+  agent: Agent
+  learner: LearnerState
+  step: int  # of the checkpoint
+
+
+def load_trained(
+  run_dir: Path | str, *, backend: str | None, step: int | None
+) -> Trained:
+  """Restores the learner of a run, and builds its worlds and agent.
+
+  ``backend`` and ``step`` are as in ``evaluate``, and so are the errors.
+  """
+  run_dir = Path(run_dir)
   config = run_folder.open_run(run_dir).config
   env_config = dataclasses.replace(config.env, backend=backend or config.env.backend)
   check_env(env_config)
-  acting = acting or config.eval_acting
-  check_name("acting", acting, ACTING)
   checkpoint_reader.restore(run_dir, step, {}, config=config)  # Fails early.
   env = make_env(env_config, instants=config.agent.lstm_instants)
   agent = make_agent(config.agent)
@@ -121,11 +157,7 @@ def evaluate(
   found = checkpoint_reader.restore(run_dir, step, {"learner": example}, config=config)
   for line in found.damaged:
     print_line(line)
-  learner = found.items["learner"]
-  play = make_player(env, lambda params: agent_policy(agent, params, acting=acting))
-  played = play_held_out(env, play, learner.target_params, episodes=episodes, seed=seed)
-  about = {"algorithm": config.agent.algorithm, "acting": acting}
-  return _summary(env, played, about, found.step, began, video)
+  return Trained(config, env, agent, found.items["learner"], found.step)
 
 
 def evaluate_expert(
@@ -149,12 +181,17 @@ def evaluate_expert(
   return _summary(env, played, {"algorithm": "expert"}, None, began, video)
 
 
-def _check(episodes: int, seed: int, video: Path | str | None) -> Path | None:
-  """Checks the arguments of an evaluation; returns the path of its video."""
+def check_count(episodes: int, seed: int) -> None:
+  """Raises ``ConfigError`` if no such episodes can be played."""
   if episodes < 1:
     raise ConfigError(f"episodes={episodes} must be at least 1")
   if not 0 <= seed < 2**31:
     raise ConfigError(f"seed={seed} must be within 0 and 2**31 - 1")
+
+
+def _check(episodes: int, seed: int, video: Path | str | None) -> Path | None:
+  """Checks the arguments of an evaluation; returns the path of its video."""
+  check_count(episodes, seed)
   if video is None:
     return None
   path = Path(video)
