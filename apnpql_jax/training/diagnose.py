@@ -177,5 +177,5 @@ def _end(instants: Instants, world: int) -> str:
   return last if last == farthest else f"{last} after {farthest}"
 
 
-def _quantiles(x: np.ndarray) -> dict[str, float]:
+def _quantiles(x: Array | np.ndarray) -> dict[str, float]:
   return {f"{q:.0%}": float(np.quantile(x, q)) for q in QUANTILES}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -65,10 +66,17 @@ def hand_made() -> Instants:
   gripper = np.zeros((4, 3, 3), bool)
   gripper[1, 0, 1] = True  # One of the two instants of the stage "goal".
   q = np.array([[0.9, 0.2, 0.0], [1.0, 0.3, 0.1], [9.0, 0.4, 0.15], [9.0, 9.0, 9.0]])
-  return Instants(
-    active=active, solved=solved, stage=stage, error=error, gripper=gripper,
-    kl=np.where(active, 2.0, np.nan), alpha=np.where(active, 0.5, np.nan), q=q,
-  )  # fmt: skip
+  arrays: Any = {
+    "active": active,
+    "solved": solved,
+    "stage": stage,
+    "error": error,
+    "gripper": gripper,
+    "kl": np.where(active, 2.0, np.nan),
+    "alpha": np.where(active, 0.5, np.nan),
+    "q": q,
+  }
+  return Instants(**arrays)
 
 
 def test_the_summary_of_hand_made_episodes():
