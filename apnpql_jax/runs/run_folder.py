@@ -23,6 +23,9 @@ CONFIG_FILE = "config.json"
 
 _MAX_CONFIG_BYTES = 1 << 20
 
+_PATTERN = "*?[]\\"
+"""Characters that Orbax takes for patterns, so that it would find no file or others."""
+
 MAY_CHANGE = (
   "total_steps eval_every eval_episodes eval_acting checkpoint_every "
   "keep_checkpoints save_replay_every max_skipped_updates video sinks"
@@ -76,6 +79,7 @@ def open_run(run_dir: Path) -> RunFolder:
     FileError: It is not a run folder, its configuration cannot be read, or a link
       leads out of it. The run would write, and delete checkpoints, elsewhere.
   """
+  _check_characters(run_dir, "\\")  # TensorStore reads a backslash as a slash.
   inside = run_dir.resolve()
   for path in sorted(run_dir.rglob("*")):
     if path.is_symlink() and not path.resolve().is_relative_to(inside):
@@ -151,8 +155,10 @@ def check_resumable(run_dir: Path, wanted: TrainConfig) -> None:
 
   Raises:
     ConfigError: A setting outside of ``MAY_CHANGE`` differs; the message lists each.
-    FileError: Another process trains the run.
+    FileError: Another process trains the run, or checkpoints cannot be saved under its
+      path.
   """
+  _check_characters(run_dir, _PATTERN)
   if diff := fixed_diff(load_run_config(run_dir), wanted):
     raise ConfigError(
       f"{str(run_dir)!r} was made with other settings: {diff}; resume it without them "
@@ -194,8 +200,10 @@ def check_free(run_dir: Path, *, overwrite: bool) -> None:
 
   Raises:
     FileError: The folder holds a run and ``overwrite`` is not set, its run is being
-      trained, or it holds anything else, which is never removed.
+      trained, it holds anything else, which is never removed, or checkpoints cannot be
+      saved under its path.
   """
+  _check_characters(run_dir, _PATTERN)
   if not run_dir.exists():
     return
   if not run_dir.is_dir() or run_dir.is_symlink():
@@ -212,6 +220,16 @@ def check_free(run_dir: Path, *, overwrite: bool) -> None:
       "with --overwrite, or choose another --run"
     )
   _check_idle(run_dir)
+
+
+def _check_characters(run_dir: Path, refused: str) -> None:
+  """Raises ``FileError`` if the absolute path has any of the refused characters."""
+  path = str(run_dir.absolute())
+  if found := sorted(set(path) & set(refused)):
+    raise FileError(
+      f"checkpoints cannot be kept under {path!r} because of {' '.join(found)} in the "
+      "path; rename that folder or choose another one"
+    )
 
 
 def _free_name(path: Path, kind: str = "") -> Path:

@@ -25,7 +25,7 @@ import pytest
 from apnpql_jax.config.files import config_to_json
 from apnpql_jax.config.schema import AgentConfig, TrainConfig
 from apnpql_jax.errors import UserError
-from apnpql_jax.runs import checkpoint_reader, checkpoint_record
+from apnpql_jax.runs import checkpoint_reader, checkpoint_record, run_folder
 from apnpql_jax.runs.checkpoint_writer import CheckpointWriter, SaveError
 from apnpql_jax.training import resume
 
@@ -69,6 +69,38 @@ def _state(seed: int = 0, images: int = 5) -> State:
     raw_key=jax.random.PRNGKey(seed),
     empty=jnp.zeros((4, 0, 3)),  # As mocap_pos of a scene without mocap bodies.
   )
+
+
+ODD = "ä %41 #{x}~\n:$HOME'\",;&@-"
+"""Characters that mean something to shells, URLs, format strings or file systems."""
+
+
+def test_a_path_of_odd_characters_keeps_its_checkpoints(tmp_path):
+  run = run_folder.create(tmp_path / ODD / ODD, CONFIG).path
+  example = {"learner": {"x": jnp.arange(3)}}
+  with CheckpointWriter(run, CONFIG, keep=2) as writer:
+    for step in (1, 2):
+      writer.save(step, example)
+  found = checkpoint_reader.restore(run, None, example)
+  np.testing.assert_array_equal(found.items["learner"]["x"], np.arange(3))
+  assert checkpoint_reader.all_steps(run) == [1, 2] and found.step == 2
+
+
+@pytest.mark.parametrize("character", "*?[]\\")
+def test_a_path_in_which_orbax_loses_checkpoints_is_refused(tmp_path, character):
+  """Anywhere in the path, and before anything is written."""
+  above = tmp_path / f"a{character}1"
+  with pytest.raises(UserError, match="cannot be kept"):
+    run_folder.create(above / "run", CONFIG)
+  assert not above.exists()
+  run = run_folder.create(tmp_path / "run", CONFIG).path.rename(above)
+  with pytest.raises(UserError, match="cannot be kept"):
+    run_folder.check_resumable(run, CONFIG)
+  if character == "\\":
+    with pytest.raises(UserError, match="cannot be kept"):
+      run_folder.open_run(run)
+  else:
+    assert run_folder.open_run(run).config == CONFIG
 
 
 def _bits(leaf: Any) -> tuple[str, tuple[int, ...], bytes]:
