@@ -17,7 +17,7 @@ from apnpql_jax.cli.commands import Json
 from apnpql_jax.cli.options import Train, parse
 from apnpql_jax.config import files
 from apnpql_jax.errors import ConfigError, UserError, check_name
-from apnpql_jax.runs.console import print_line
+from apnpql_jax.runs.console import print_line, reporting
 from apnpql_jax.runs.signals import Signals
 
 
@@ -27,6 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
   0 is success, 2 bad input, 3 a run that had to stop (disk full, non-finite updates),
   130 Ctrl-C and 143 SIGTERM, with the run saved. All but 0 print one line to stderr.
   """
+  _fill_closed_streams()
   runtime.configure()
   runtime.collect_garbage_less_often()
   args = list(sys.argv[1:] if argv is None else argv)
@@ -34,10 +35,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not args:
       raise ConfigError(f"name a command: {', '.join(_COMMANDS)} (see apnpql --help)")
     if args[0] in ("-h", "--help"):
-      print(_help())
+      _print(_help())
       return 0
     if args[0] == "--version":
-      print(__version__)
+      _print(__version__)
       return 0
     check_name("command", args[0], list(_COMMANDS))
     kind, command = _COMMANDS[args[0]]
@@ -45,7 +46,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     with Signals("interrupted"), _json_only(parsed.json) as write:
       result = command(parsed)
       if result:  # Empty in all but the first of several processes.
-        write(json.dumps(_plain(result)) if parsed.json else _show(result))
+        with reporting("print the result"):
+          write(json.dumps(_plain(result)) if parsed.json else _show(result))
     return 0
   except UserError as error:
     print_line(f"apnpql: {' '.join(str(error).split())}")
@@ -58,9 +60,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     return stop.code
   except KeyboardInterrupt:
     return errors.INTERRUPTED + signal.SIGINT
-  except BrokenPipeError:  # The reader of our output has exited, as `head` does.
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    return 0
+
+
+def _fill_closed_streams() -> None:
+  """Opens closed standard streams, whose numbers the next files would get."""
+  for number in range(3):
+    try:
+      os.fstat(number)
+    except OSError:
+      os.open(os.devnull, os.O_RDWR)  # Takes the lowest free number.
 
 
 def _parse(kind: type[Any], args: Sequence[str]) -> Any:
@@ -82,7 +90,7 @@ def _json_only(enabled: bool) -> Generator[Callable[[str], Any], None, None]:
   Redirects the file descriptor, because libraries print below Python too.
   """
   if not enabled:
-    yield print
+    yield _print
     return
   sys.stdout.flush()
   stdout = os.dup(1)
@@ -93,6 +101,17 @@ def _json_only(enabled: bool) -> Generator[Callable[[str], Any], None, None]:
     sys.stdout.flush()
     os.dup2(stdout, 1)
     os.close(stdout)
+
+
+def _print(text: str) -> None:
+  """Prints to standard output, at once, so that a failure shows here."""
+  try:
+    print(text, flush=True)
+  except OSError as error:
+    # Python tries again at its exit, and would change the exit code.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    if not isinstance(error, BrokenPipeError):  # The reader has enough, as `head`.
+      print_line(f"cannot print the result: {error}")
 
 
 def _plain(value: Any) -> Any:

@@ -9,7 +9,8 @@ from pathlib import Path
 import time
 from typing import Any, Protocol
 
-from apnpql_jax.errors import FileError
+from apnpql_jax.errors import FileError, one_line
+from apnpql_jax.runs.console import print_line, reporting
 from apnpql_jax.runs.text import write_text
 
 STEP = "step"  # environment steps, summed over worlds; in every row
@@ -74,7 +75,7 @@ class MetricWriter:
       FileError: A row cannot be read.
     """
     self._path = run_dir / "metrics.jsonl"
-    self._sinks, self._clock, self._max_bytes = tuple(sinks), clock, max_bytes
+    self._sinks, self._clock, self._max_bytes = list(sinks), clock, max_bytes
     rows = self._rows_until(resume_step)
     # Rewritten, because a killed process may have left half a line.
     write_text(self._path, "".join(_json_line(row) for row in rows))
@@ -91,13 +92,18 @@ class MetricWriter:
       file.write(_json_line(row))
     if self._path.stat().st_size > self._max_bytes:
       self._path.rename(_numbered(self._path, len(metric_files(self._path.parent))))
-    for sink in self._sinks:
-      sink.write(step, numbers)
+    for sink in self._sinks[:]:
+      try:
+        sink.write(step, numbers)
+      except Exception as error:  # Whatever its library raises.
+        print_line(f"a metric sink failed and gets no more rows: {one_line(error)}")
+        self._sinks.remove(sink)
 
   def close(self) -> None:
     """Closes the sinks; the file is always complete."""
     for sink in self._sinks:
-      sink.close()
+      with reporting("close a metric sink"):
+        sink.close()
 
   def __enter__(self) -> MetricWriter:
     return self

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 import sys
 import time
-from typing import TextIO
+from typing import Any, TextIO
+
+from apnpql_jax.runs.console import Unfailing
 
 _SPEED_PERIOD_S = 600.0
 """Speeds are averaged over this time, which has to span several slow iterations."""
@@ -33,7 +35,7 @@ class TrainProgress:
     """
     from rich import console, progress
 
-    stream = stream or sys.stderr
+    unfailing: Any = Unfailing(stream or sys.stderr)
     self._period, self._clock = period_s, clock
     text = "{task.completed:,} steps  {task.fields[figures]}"
     self._time_left = progress.TimeRemainingColumn()
@@ -42,10 +44,10 @@ class TrainProgress:
       progress.TaskProgressColumn(),
       progress.TextColumn(text, markup=False),
       self._time_left,
-      console=console.Console(file=stream),
+      console=console.Console(file=unfailing),
       speed_estimate_period=_SPEED_PERIOD_S,
       get_time=clock,
-      disable=not stream.isatty(),
+      disable=not unfailing.isatty(),
     )
     self._bar.add_task("steps", total=total_steps, figures="starting")
     self._bar.add_task("updates", total=None, visible=False)

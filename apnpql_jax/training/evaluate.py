@@ -21,7 +21,7 @@ from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs import checkpoint_reader, leaves, run_folder
-from apnpql_jax.runs.console import print_line
+from apnpql_jax.runs.console import print_line, reporting
 from apnpql_jax.runs.metrics import wilson_interval
 from apnpql_jax.training.rollout import (
   Episodes,
@@ -219,9 +219,7 @@ def _summary(
   summary: dict[str, Any] = {"task": env.config.task, "backend": env.physics.name}
   summary |= about | figures_of(played)
   if video is not None:
-    try:
+    summary["video"] = None
+    with reporting(f"write {video}"):  # The episodes took minutes; keep their figures.
       summary["video"] = str(record_episodes(env, played, video))
-    except OSError as error:  # The episodes took minutes; keep their figures.
-      print_line(f"cannot write {video}: {error}")
-      summary["video"] = None
   return summary | {"checkpoint_step": step, "wall_s": time.monotonic() - began}

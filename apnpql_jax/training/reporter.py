@@ -12,6 +12,7 @@ from apnpql_jax import devices
 from apnpql_jax.agents.learner import Agent
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.envs.env import Env
+from apnpql_jax.runs.console import reporting
 from apnpql_jax.runs.metrics import MetricWriter, plot_curve, read_evaluations
 from apnpql_jax.runs.progress import TrainProgress
 from apnpql_jax.training.evaluate import figures_of, play_held_out
@@ -68,10 +69,12 @@ class Reporter:
     row = {f"eval/{name}": value for name, value in figures.items() if name != "ci95"}
     row["eval/ci95_low"], row["eval/ci95_high"] = figures["ci95"]
     self.writer.write(step, row | {"eval/wall_s": time.monotonic() - began})
-    rows = read_evaluations(run_dir)
-    plot_curve(rows, run_dir / "curve.png", title=config.env.task)
+    with reporting("draw the curve"):
+      rows = read_evaluations(run_dir)
+      plot_curve(rows, run_dir / "curve.png", title=config.env.task)
     if config.video and last:
-      record_episodes(self._env, played, run_dir / "videos" / f"step_{step:08d}.mp4")
+      with reporting("write the video"):
+        record_episodes(self._env, played, run_dir / "videos" / f"step_{step:08d}.mp4")
     rate = figures["success_rate"]
     self._progress.message(
       f"step {step:,}: {figures['successes']} of {figures['episodes']} held-out "

@@ -166,6 +166,24 @@ def test_list_prints_one_json_object_and_nothing_else(tmp_path):
   assert names["backends"] == list(BACKENDS)
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="only on Linux")
+@pytest.mark.parametrize(
+  "streams", [">/dev/full", "2>/dev/full", ">&-", ">&- 2>&- <&-"]
+)
+def test_output_that_cannot_be_written_changes_no_exit_code(streams, tmp_path):
+  command = f"{sys.executable} -m apnpql_jax --version {streams}"
+  done = subprocess.run(
+    ["sh", "-c", command],
+    cwd=tmp_path,
+    env=dict(os.environ, PYTHONPATH=str(ROOT)),
+    capture_output=True,
+    text=True,
+  )
+  assert done.returncode == 0 and not any(tmp_path.iterdir())
+  expected = "cannot print the result: [Errno 28] No space left on device\n"
+  assert done.stderr == (expected if streams == ">/dev/full" else "")
+
+
 def test_list_prints_the_same_names_as_text(tmp_path):
   done = apnpql("list", cwd=tmp_path)
   assert done.returncode == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import json
 import os
@@ -21,6 +22,7 @@ from tensorboardX.proto import event_pb2
 
 from apnpql_jax.errors import UserError
 from apnpql_jax.runs import metrics
+from apnpql_jax.runs.console import print_line
 from apnpql_jax.runs.progress import TrainProgress
 from apnpql_jax.runs.sinks import check_sinks, make_sinks
 
@@ -156,6 +158,42 @@ def test_more_sinks_get_the_same_numbers(tmp_path: Path):
     writer.write(3, {"a": jnp.float32(0.5)})
     assert not sink.closed
   assert sink.rows == [(3, {"a": 0.5})] and sink.closed
+
+
+class FullDisk(io.StringIO):
+  """A stream to a file on a full disk."""
+
+  def write(self, text: str) -> int:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_progress_goes_on_if_its_stream_is_full_or_closed(monkeypatch):
+  closed = io.StringIO()
+  closed.close()
+  for stream in (FullDisk(), closed, None):
+    monkeypatch.setattr(sys, "stderr", stream)
+    with TrainProgress(10, period_s=0) as progress:
+      progress.update(5, updates=1)
+      progress.message("half")
+    print_line("done")
+
+
+def test_a_broken_sink_costs_no_rows(tmp_path: Path, capsys):
+  class Broken:
+    def write(self, step: int, row: object) -> None:
+      raise RuntimeError("no network")
+
+    def close(self) -> None:
+      raise AssertionError("was dropped")
+
+  with metrics.MetricWriter(tmp_path, sinks=[Broken()]) as writer:
+    writer.write(1, {"a": 0.5})
+    writer.write(2, {"a": 0.5})
+  assert [row["step"] for row in metrics.read_rows(tmp_path / "metrics.jsonl")] == [
+    1,
+    2,
+  ]
+  assert capsys.readouterr().err.count("no network") == 1
 
 
 def test_tensorboard_holds_every_number(tmp_path: Path):

@@ -18,6 +18,7 @@ from apnpql_jax.cli.options import Evaluate
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import ConfigError, FileError, UserError
 from apnpql_jax.runs import checkpoint_reader, run_folder
+from apnpql_jax.training import reporter
 from apnpql_jax.training.evaluate import evaluate
 from apnpql_jax.training.train import train
 from apnpql_jax.training.video import HOLD
@@ -145,12 +146,23 @@ def test_evaluate_has_the_defaults_of_the_command_line():
     assert defaults[name].default == getattr(Evaluate(), name)
 
 
-def test_resume_continues_the_run(finished):
+def test_resume_continues_the_run(finished, monkeypatch, capsys):
+  """Even if nothing can be drawn: what only reports must not cost a checkpoint."""
+
+  def broken(*args: object, **settings: object) -> None:
+    raise RuntimeError("no library")
+
+  for name in ("plot_curve", "record_episodes"):
+    monkeypatch.setattr(reporter, name, broken)
   run_dir, _ = finished
   config = run_folder.open_run(run_dir).config
-  longer = dataclasses.replace(config, total_steps=96, video=False)
+  longer = dataclasses.replace(config, total_steps=96)
   summary = train(longer, run_dir, resume=True)
   assert summary["env_steps"] == 96 and summary["updates"] == 24
+  assert checkpoint_reader.latest_step(run_dir) == 96
+  shown = capsys.readouterr().err
+  for report in ("draw the curve", "write the video"):
+    assert shown.count(f"cannot {report}: no library") == 1
   rows = (run_dir / "metrics.jsonl").read_text().splitlines()
   steps = [json.loads(row)["step"] for row in rows if "loss/q" in row]
   assert steps == [*range(8, 104, 8)]
