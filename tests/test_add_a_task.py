@@ -30,19 +30,27 @@ def test_the_task_of_the_guide_runs(tmp_path: Path):
     assert not (tmp_path / name).exists()
     (tmp_path / name).write_text(content)
 
-  def apnpql(*args: str) -> dict:
-    command = [sys.executable, "-m", "apnpql_jax", *args, "--json"]
-    done = subprocess.run(
-      command,
+  def apnpql(*args: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+      [sys.executable, "-m", "apnpql_jax", *args, "--json"],
       cwd=tmp_path,
       env=dict(os.environ, PYTHONPATH=str(tmp_path)),
       capture_output=True,
       text=True,
-      check=True,
     )
-    return json.loads(done.stdout)
 
-  names = apnpql("list")
+  # Neither a broken file nor a copy that keeps its name costs the other tasks anything.
+  tasks = tmp_path / "apnpql_jax" / "tasks"
+  (tasks / "broken.py").write_text("1 / 0\n")
+  shutil.copy(tasks / "push_plate.py", tasks / "a_copy.py")
+  listed = apnpql("list")
+  names = json.loads(listed.stdout)
   assert "touch_ball" in names["tasks"] and "touch_ball" in names["presets"]
-  figures = apnpql("collect", "touch_ball", "--episodes", "32")
+  line = "apnpql_jax.tasks.broken is left out: ZeroDivisionError: division by zero"
+  assert listed.stderr.count(line) == 1 and len(listed.stderr.splitlines()) == 2
+  refused = apnpql("collect", "push_plate")
+  assert refused.returncode == 2 and "'push_plate'" in refused.stderr.splitlines()[-1]
+  assert "is taken by apnpql_jax.tasks.a_copy" in refused.stderr.splitlines()[-1]
+
+  figures = json.loads(apnpql("collect", "touch_ball", "--episodes", "32").stdout)
   assert figures["successes"] >= 31 and figures["mean_length"] < 30

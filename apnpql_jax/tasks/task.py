@@ -7,13 +7,14 @@ worlds on the first axis; positions are in m in the world frame.
 from __future__ import annotations
 
 import importlib
+import logging
 import pkgutil
 from typing import NamedTuple, Protocol, TypeVar
 
 from jaxtyping import Bool, Float, Int
 import numpy as np
 
-from apnpql_jax.errors import ConfigError, check_name
+from apnpql_jax.errors import ConfigError, check_name, one_line
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.sim.scene import Scene
@@ -67,8 +68,21 @@ class Task(Protocol):
     """Returns the scripted expert's actions, given those that follow the primitives."""
 
 
+class _NameTaken(ConfigError):
+  """Another class has the name."""
+
+  def __init__(self, message: str, name: str):
+    super().__init__(message)
+    self.name = name
+
+
 T = TypeVar("T", bound=Task)
 _REGISTRY: dict[str, type[Task]] = {}
+_CLASHES: dict[str, str] = {}
+"""Name -> message, for names that two files of this package want."""
+
+_LEFT_OUT: set[str] = set()
+"""Modules that cannot be imported."""
 
 
 def register_task(task: type[T]) -> type[T]:
@@ -78,23 +92,42 @@ def register_task(task: type[T]) -> type[T]:
   """
   holder = _REGISTRY.setdefault(task.name, task)
   if (holder.__module__, holder.__qualname__) != (task.__module__, task.__qualname__):
-    raise ConfigError(
+    raise _NameTaken(
       f"task name {task.name!r} of {task.__module__}.{task.__qualname__} is taken by "
-      f"{holder.__module__}.{holder.__qualname__}; choose another name"
+      f"{holder.__module__}.{holder.__qualname__}; choose another name",
+      task.name,
     )
   _REGISTRY[task.name] = task
   return task
 
 
 def task_names() -> list[str]:
-  """Returns the names of all tasks, sorted; imports the modules of this package."""
+  """Returns the names of all tasks, sorted; imports the modules of this package.
+
+  Logs one line for a module that cannot be imported, and leaves its task out.
+  """
   package = importlib.import_module("apnpql_jax.tasks")
-  for module in pkgutil.iter_modules(package.__path__):
-    importlib.import_module(f"apnpql_jax.tasks.{module.name}")
+  for found in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
+    if found.name in _LEFT_OUT:
+      continue
+    try:
+      importlib.import_module(found.name)
+    except Exception as error:  # Whatever is wrong with a file of the user.
+      _LEFT_OUT.add(found.name)
+      if isinstance(error, _NameTaken):
+        _CLASHES[error.name] = str(error)
+      reason = f"{type(error).__name__}: {one_line(error)}"
+      logging.getLogger(__name__).warning("%s is left out: %s", found.name, reason)
   return sorted(_REGISTRY)
 
 
 def make_task(name: str) -> Task:
-  """Builds the task ``name``; an unknown name raises ``ConfigError``."""
+  """Builds the task ``name``.
+
+  Raises:
+    ConfigError: No task has this name, or two files want it.
+  """
   check_name("task", name, task_names())
+  if name in _CLASHES:
+    raise ConfigError(_CLASHES[name])
   return _REGISTRY[name]()
