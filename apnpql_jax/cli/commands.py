@@ -70,6 +70,7 @@ def evaluate(args: Evaluate) -> Json:
   """Plays held-out episodes with a checkpoint of a run."""
   if not args.run:
     raise ConfigError("evaluate needs a run folder: apnpql evaluate RUN")
+  _check_free(args.video, overwrite=args.overwrite)
   run_folder.load_run_config(Path(args.run), print_line)
 
   from apnpql_jax.training.evaluate import evaluate as evaluate_run
@@ -104,6 +105,9 @@ def diagnose(args: Diagnose) -> Json:
 
 def collect(args: Collect) -> Json:
   """Plays episodes with the scripted expert of a task."""
+  _check_free(args.video, overwrite=args.overwrite)
+  if args.save is not None:
+    _check_demonstrations(args.save, overwrite=args.overwrite)
   # The expert acts on privileged poses, so images are not needed.
   env = dataclasses.replace(_task_env(args.task), backend=args.backend, obs="state")
 
@@ -121,6 +125,7 @@ def convert(args: Convert) -> Json:
   """Converts recorded joint trajectories into demonstrations."""
   if not args.out:
     raise ConfigError("usage: apnpql convert REC.npz TASK OUT.npz")
+  _check_demonstrations(Path(args.out), overwrite=args.overwrite)
   env = _task_env(args.task)
 
   from apnpql_jax import tasks
@@ -190,6 +195,19 @@ def _mesh(args: Train) -> Mesh | None:
     return devices.make_mesh(args.devices)
   devices.join(args.coordinator, args.processes, args.process)
   return devices.make_mesh(0)
+
+
+def _check_demonstrations(path: Path, *, overwrite: bool) -> None:
+  """Raises ``ConfigError`` if demonstrations cannot be written, or must not be."""
+  if path.is_dir() or not path.absolute().parent.is_dir():
+    raise ConfigError(f"{path} is a folder, or in none; name a file to write")
+  _check_free(path, overwrite=overwrite)
+
+
+def _check_free(path: Path | None, *, overwrite: bool) -> None:
+  """Raises ``ConfigError`` if a file exists and must not be replaced."""
+  if path is not None and path.is_file() and not overwrite:
+    raise ConfigError(f"{path} exists; replace it with --overwrite, or name another")
 
 
 def _task_env(task: str) -> EnvConfig:

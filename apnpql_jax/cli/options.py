@@ -44,6 +44,9 @@ class _Play(_Command):
   video: _File = None
   """Also write a video of the first four episodes to this .mp4 or .gif file."""
 
+  overwrite: _Flag = False
+  """Replace files that exist."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Train(_Command):
@@ -162,6 +165,9 @@ class Convert(_Command):
 
   out: tyro.conf.Positional[str] = ""
   """File to write, for --replay.demonstrations."""
+
+  overwrite: _Flag = False
+  """Replace the file if it exists."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from apnpql_jax import devices
+from apnpql_jax.atomic import replacing
 from apnpql_jax.data import npz
 from apnpql_jax.errors import FileError, UserError
 from apnpql_jax.sim.scene import Scene, free_joints
@@ -50,7 +51,8 @@ def save(
   arrays: dict[str, Any] = {"format": FORMAT, "version": VERSION, "task": task}
   arrays |= {"control_period_s": control_period_s, **demos._asdict()}
   try:
-    with path.open("wb") as file:  # NumPy appends a suffix to file names.
+    # NumPy appends a suffix to file names.
+    with replacing(path) as part, part.open("wb") as file:
       np.savez_compressed(file, **arrays)
   except OSError as error:
     raise FileError(f"cannot write {path}: {error}") from None

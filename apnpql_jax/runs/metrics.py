@@ -9,6 +9,7 @@ from pathlib import Path
 import time
 from typing import Any, Protocol
 
+from apnpql_jax.atomic import replacing
 from apnpql_jax.errors import FileError, one_line
 from apnpql_jax.runs.console import print_line, reporting
 from apnpql_jax.runs.text import write_text
@@ -201,9 +202,8 @@ def plot_curve(rows: Sequence[Row], path: Path, *, title: str = "") -> None:
     axis.set(ylim=(-2, 102))
     axis.grid(alpha=0.3)
   figure.suptitle(title)
-  part = path.with_name(path.name + ".part")
-  figure.savefig(part, dpi=120, format="png")
-  part.replace(path)
+  with replacing(path) as part:
+    figure.savefig(part, dpi=120)
 
 
 def _interval(row: Row) -> tuple[float, float]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
+
+from apnpql_jax.atomic import replacing
 
 
 def read_text(path: Path, limit: int) -> str:
@@ -21,6 +22,5 @@ def read_text(path: Path, limit: int) -> str:
 
 def write_text(path: Path, text: str) -> None:
   """Writes a file atomically, so that a killed run leaves no half of one."""
-  part = path.with_name(path.name + ".part")
-  part.write_text(text, encoding="utf-8")
-  os.replace(part, path)
+  with replacing(path) as part:
+    part.write_text(text, encoding="utf-8")

@@ -11,6 +11,7 @@ import imageio.v3 as iio
 import jax
 import numpy as np
 
+from apnpql_jax.atomic import replacing
 from apnpql_jax.envs.cameras import camera_renderer
 from apnpql_jax.envs.env import Env
 from apnpql_jax.training.rollout import Episodes
@@ -134,14 +135,15 @@ def write_video(path: Path, frames: np.ndarray, *, fps: float) -> Path:
   """
   _check(frames)
   if path.suffix == ".gif":
-    iio.imwrite(path, frames, duration=1000.0 / fps, loop=0)
+    with replacing(path) as part:
+      iio.imwrite(part, frames, duration=1000.0 / fps, loop=0)
     return path
   path = path.with_suffix(".mp4")
   padding = [-side % _MACROBLOCK for side in frames.shape[1:3]]
   frames = np.pad(frames, ((0, 0), (0, padding[0]), (0, padding[1]), (0, 0)))
   height, width = frames.shape[1:3]
   # imageio's PyAV plugin cannot set the rate factor.
-  with av.open(str(path), "w") as file:
+  with replacing(path) as part, av.open(str(part), "w", format="mp4") as file:
     stream = file.add_stream("libx264", Fraction(fps).limit_denominator(1000))
     stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
     # Flat colors and hard edges need a rate factor below the default of 23.

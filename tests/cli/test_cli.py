@@ -105,6 +105,8 @@ BAD_INPUT = [
   ("collect push_plate --noise nan", ["noise=nan"]),
   ("collect push_plate --episodes many", ["--episodes", "'many'"]),
   ("collect push_plate --video runs", ["video", ".mp4", ".gif"]),
+  ("collect push_plate --save runs", ["runs is a folder"]),
+  ("collect push_plate --save none/x.npz", ["none/x.npz is a folder, or in none"]),
   ("collect push_plate --video runs/old/config.json/x.mp4", ["video", "written"]),
   ("evaluate runs/old --video x.avi", ["video", ".mp4", ".gif"]),
   ("list tasks", ["tasks"]),
@@ -135,6 +137,26 @@ def test_a_process_with_bad_input_prints_the_same_line(
   done = apnpql(*line.split(), cwd=tmp_path)
   monkeypatch.chdir(tmp_path)
   assert (done.returncode, done.stderr) == (main(line.split()), capfd.readouterr().err)
+
+
+def test_existing_files_are_replaced_only_if_asked(run_dir, tmp_path, capsys):
+  """Checked before anything is computed; a recording may be its own output."""
+  for name in ("file.npz", "file.mp4"):
+    (tmp_path / name).write_text("precious")
+  demos, video = str(tmp_path / "file.npz"), str(tmp_path / "file.mp4")
+  before = snapshot(tmp_path)
+  for command in (
+    ["convert", demos, "push_plate", demos],
+    ["collect", "push_plate", "--save", demos],
+    ["collect", "push_plate", "--video", video],
+    ["evaluate", str(run_dir), "--video", video],
+  ):
+    assert main(command) == 2
+    assert "exists; replace it with --overwrite" in capsys.readouterr().err
+  assert snapshot(tmp_path) == before
+  assert main(["convert", demos, "push_plate", demos, "--overwrite"]) == 2
+  assert "not an .npz archive" in capsys.readouterr().err
+  assert snapshot(tmp_path) == before
 
 
 def test_a_run_older_than_a_setting_keeps_its_behavior(run_dir, tmp_path):
