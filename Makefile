@@ -23,7 +23,7 @@ train: $(VENV)/.runtime
 	$(BIN)/apnpql train $(PRESET) $(if $(RUN),--run "$(RUN)") $(ARGS)
 
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest -n auto --dist loadfile $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

@@ -123,6 +123,7 @@ def test_every_module_can_be_imported():
   assert missing <= {"pybullet", "torch"}
 
 
+@pytest.mark.slow
 def test_other_layouts_draw_the_same():
   sizes = render.RESOLUTIONS["tiny"]
   scene = load_scene(mjcf_path(render.SCENE))

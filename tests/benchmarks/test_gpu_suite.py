@@ -19,6 +19,7 @@ def test_its_sections_are_benchmarks():
   assert list(suite.SECTIONS)[0] == "training from pixels"
 
 
+@pytest.mark.slow
 def test_sections_end_with_results_or_with_a_reason(tmp_path):
   out = tmp_path / "gpu.json"
   whole = suite.Suite(out, str(tmp_path), time.monotonic() + 300)
