@@ -21,6 +21,7 @@ if TYPE_CHECKING:
   from apnpql_jax.errors import ConfigError, FileError, RunStopped, UserError
   from apnpql_jax.runtime import configure
   from apnpql_jax.tasks.task import Task, make_task, register_task, task_names
+  from apnpql_jax.training.diagnose import diagnose
   from apnpql_jax.training.evaluate import evaluate
   from apnpql_jax.training.train import train
 
@@ -33,6 +34,7 @@ _MODULES = {
   "errors": ("ConfigError", "FileError", "RunStopped", "UserError"),
   "runtime": ("configure",),
   "tasks.task": ("Task", "make_task", "register_task", "task_names"),
+  "training.diagnose": ("diagnose",),
   "training.evaluate": ("evaluate",),
   "training.train": ("train",),
 }
