@@ -10,11 +10,12 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Generator[Path, None, None]:
-  """Yields a temporary name beside ``path``, which becomes ``path`` at the end.
+  """Yields a temporary path; when the block ends, that file replaces ``path``.
 
-  It has the same suffix, from which libraries guess the format. If the block raises,
-  the temporary file is removed and ``path`` stays as it is. A link keeps its place, and
-  a device is written directly.
+  It is in the same folder and has the same suffix, from which libraries guess the
+  format. If the block raises, the temporary file is removed and ``path`` is unchanged.
+  If ``path`` is a link, the file that it leads to is replaced. A device is written
+  directly.
   """
   path = path.resolve()
   if path.exists() and not path.is_file():

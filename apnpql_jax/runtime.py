@@ -62,7 +62,7 @@ def configure() -> None:
 def collect_garbage_less_often() -> None:
   """Lets Python's garbage collector pass over what the imports made, and run less.
 
-  Tracing allocates so many objects that a tenth of a run's start is its work.
+  Tracing allocates so many objects that collecting them would slow down each start.
   """
   gc.freeze()
   gc.set_threshold(50_000, 20, 20)

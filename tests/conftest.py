@@ -38,7 +38,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-  """Saves a quarter of the tests' time."""
+  """Keeps the garbage collector from slowing down the compilations."""
   runtime.collect_garbage_less_often()
 
 

@@ -68,15 +68,13 @@ def train(args: Train) -> Json:
 
 def evaluate(args: Evaluate) -> Json:
   """Plays held-out episodes with a checkpoint of a run."""
-  if not args.run:
-    raise ConfigError("evaluate needs a run folder: apnpql evaluate RUN")
+  run_dir = _existing_run(args.run, "evaluate")
   _check_free(args.video, overwrite=args.overwrite)
-  run_folder.load_run_config(Path(args.run), print_line)
 
   from apnpql_jax.training.evaluate import evaluate as evaluate_run
 
   return evaluate_run(
-    Path(args.run),
+    run_dir,
     episodes=args.episodes,
     seed=args.seed,
     backend=args.backend,
@@ -88,14 +86,12 @@ def evaluate(args: Evaluate) -> Json:
 
 def diagnose(args: Diagnose) -> Json:
   """Reports what limits the success of a trained agent."""
-  if not args.run:
-    raise ConfigError("diagnose needs a run folder: apnpql diagnose RUN")
-  run_folder.load_run_config(Path(args.run), print_line)
+  run_dir = _existing_run(args.run, "diagnose")
 
   from apnpql_jax.training.diagnose import diagnose as diagnose_run
 
   return diagnose_run(
-    Path(args.run),
+    run_dir,
     episodes=args.episodes,
     seed=args.seed,
     backend=args.backend,
@@ -195,6 +191,14 @@ def _mesh(args: Train) -> Mesh | None:
     return devices.make_mesh(args.devices)
   devices.join(args.coordinator, args.processes, args.process)
   return devices.make_mesh(0)
+
+
+def _existing_run(run: str, command: str) -> Path:
+  """Returns the folder of a run; raises ``UserError`` if it is not one."""
+  if not run:
+    raise ConfigError(f"{command} needs a run folder: apnpql {command} RUN")
+  run_folder.load_run_config(Path(run), print_line)
+  return Path(run)
 
 
 def _check_demonstrations(path: Path, *, overwrite: bool) -> None:

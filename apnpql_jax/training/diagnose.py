@@ -1,7 +1,7 @@
 """Diagnosis of a trained agent: where its episodes fail, and what limits them.
 
-Stages are told apart by the scripted expert: an instant belongs to the stage "object",
-"goal" or "neutral" if the expert would follow that primitive there.
+The scripted expert defines the stages: an instant belongs to the stage "object", "goal"
+or "neutral" if the expert would follow that primitive there.
 """
 
 from __future__ import annotations
