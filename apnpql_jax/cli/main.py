@@ -154,7 +154,7 @@ def _text(value: Any) -> str:
 
 def _number(value: Any) -> str:
   if isinstance(value, float):
-    return f"{value:.3g}"
+    return f"{value:.3g}" if abs(value) < 100 else f"{value:,.0f}"
   return f"{value:,}" if isinstance(value, int) else str(value)
 
 
