@@ -8,10 +8,12 @@ import math
 from typing import Any
 
 from flax import linen as nn
+import jax
 import jax.numpy as jnp
 from jaxtyping import Float, UInt8
 import numpy as np
 
+from apnpql_jax.agents.layers import PositionwiseDense
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.types import ARM_DOF, Array, Observation
 
@@ -43,11 +45,11 @@ class PixelEncoder(nn.Module):
     # Rearrange bytes, a quarter of the memory traffic, into cells of four patches, so
     # that the second layer finds its windows without strided copies.
     cells = space_to_depth(space_to_depth(image, PATCH), 2)
-    cells = cells.reshape(*cells.shape[:-1], 4, -1).astype(jnp.float32) / 255.0
-    patches = nn.Dense(first, name="patches")(cells)
+    cells = cells.reshape(*cells.shape[:-1], 4, -1).astype(jnp.float32)
+    patches = PositionwiseDense(first, input_scale=1.0 / 255.0, name="patches")(cells)
     cells = nn.relu(patches)
     x = windows(cells) if self.overlap else cells.reshape(*cells.shape[:-2], -1)
-    x = nn.Dense(second, name="conv")(x)
+    x = PositionwiseDense(second, name="conv")(x)
     for i in range(self.residual_blocks):
       x = ResidualBlock(second, name=f"block_{i}")(x)
     points = jnp.concatenate([keypoints(patches), keypoints(x[..., None, :])], axis=-1)
@@ -131,12 +133,15 @@ def keypoints(scores: Float[Array, "*b R S P C"]) -> Float[Array, "*b 2*C"]:
   down, across = (np.stack(np.divmod(np.arange(parts), side)) + 0.5) / side
   row = 2.0 * (np.arange(rows)[:, None, None] + down) / rows - 1.0
   column = 2.0 * (np.arange(columns)[:, None] + across) / columns - 1.0
-  where = np.stack(np.broadcast_arrays(row, column), axis=-1).reshape(-1, 2)
-  # Average the centers under the softmax of each channel.
-  flat = _SHARPNESS * scores.reshape(*batch, rows * columns * parts, channels)
-  share = nn.softmax(flat, axis=-2)
-  points = jnp.einsum("...pc,pd->...cd", share, where.astype(np.float32))
-  return points.reshape(*batch, 2 * channels)
+  where = np.stack(np.broadcast_arrays(1.0, row, column)).reshape(3, -1)
+  # Average the centers under the softmax of each channel. One product sums numerators
+  # and denominators, and needs no transposed copy of the map.
+  flat = _SHARPNESS * scores.reshape(-1, rows * columns * parts, channels)
+  highest = jax.lax.stop_gradient(jnp.max(flat, axis=-2, keepdims=True))
+  where = jnp.broadcast_to(where.astype(np.float32), (len(flat), *where.shape))
+  sums = where @ jnp.exp(flat - highest)
+  points = sums[:, 1:] / sums[:, :1]
+  return jnp.swapaxes(points, -1, -2).reshape(*batch, 2 * channels)
 
 
 def seen_from(

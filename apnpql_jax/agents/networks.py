@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Float, PRNGKeyArray
 
 from apnpql_jax.agents.encoder import Encoder
-from apnpql_jax.agents.layers import MLP, Constant
+from apnpql_jax.agents.layers import MLP, PRODUCTS, Constant
 from apnpql_jax.agents.mixture_head import mixture_from_outputs, mixture_size
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.dists.gmm import GripperGMM
@@ -50,9 +50,9 @@ class Networks:
     """Returns the heads at a batch of states; only this method runs the encoder."""
     return Heads(self, params, self.apply("encoder", params, observation))
 
-  def apply(self, group: str, params: Params, *inputs: Any) -> Any:
+  def apply(self, group: str, params: Params, *inputs: Any, **options: Any) -> Any:
     """Applies the module of ``group`` to ``inputs``."""
-    return self.modules[group].apply({"params": params[group]}, *inputs)
+    return self.modules[group].apply({"params": params[group]}, *inputs, **options)
 
 
 def make_networks(
@@ -147,13 +147,16 @@ class Heads:
       raw = self._apply("alpha", jax.lax.stop_gradient(self.phi))[..., 0]
     return jax.nn.softplus(raw + offset) + self.config.min_alpha
 
-  def z(self, actions: Float[Array, " s *b 7"]) -> Float[Array, " s *b n"]:
-    """Returns the outputs of the value head."""
-    return self._apply("z", self.phi, actions)
+  def z(
+    self, actions: Float[Array, " s *b 7"], *, precision: str = "float32"
+  ) -> Float[Array, " s *b n"]:
+    """Returns the outputs of the value head; ``precision`` is a key of ``PRODUCTS``."""
+    product = PRODUCTS[precision]
+    return self._apply("z", self.phi, actions, product=product)
 
   def q(self, actions: Float[Array, " s *b 7"]) -> Float[Array, " s *b"]:
     """Returns the expected return."""
     return self.networks.value(self.z(actions))
 
-  def _apply(self, group: str, *inputs: Array) -> Any:
-    return self.networks.apply(group, self.params, *inputs)
+  def _apply(self, group: str, *inputs: Array, **options: Any) -> Any:
+    return self.networks.apply(group, self.params, *inputs, **options)

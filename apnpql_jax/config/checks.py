@@ -25,6 +25,7 @@ _CHOICES = {
   "env.backend": BACKENDS,
   "env.obs": OBSERVATIONS,
   "eval_acting": ACTING,
+  "agent.candidate_precision": ("float32", "bfloat16"),
   "agent.temperature": ("state", "shared", "fixed"),
   "agent.regularizer": ("row", "uniform"),
   "agent.policy_evaluation": POLICY_EVALUATIONS,

@@ -49,35 +49,40 @@ class GripperGMM(ActionDistribution):
   def _sample_n(self, key: PRNGKeyArray, n: int) -> Float[Array, "n *b d+1"]:
     key_arm, key_choice = jax.random.split(key)
     batch, dim, dtype = self.loc.shape[:-2], self.loc.shape[-1], self.loc.dtype
-    noise = jax.random.normal(key_arm, (n, *batch, dim), dtype)
-    uniform = jax.random.uniform(key_choice, (2, n, *batch), dtype)
+    # Until the end, draws are behind the batch, as batched matrix products want them.
+    noise = jax.random.normal(key_arm, (*batch, n, dim), dtype)
+    uniform = jax.random.uniform(key_choice, (2, *batch, n), dtype)
     # Choose components by inverting the cumulative distribution.
-    above = jnp.cumsum(jax.nn.softmax(self.logits), axis=-1)
-    component = jnp.sum(uniform[0, ..., None] >= above[None, ..., :-1], axis=-1)
+    above = jnp.cumsum(jax.nn.softmax(self.logits), axis=-1)[..., None, :]
+    component = jnp.sum(uniform[0, ..., None] >= above[..., :-1], axis=-1)
     chosen = jax.nn.one_hot(component, self.logits.shape[-1], dtype=dtype)
     # Transform each draw by every component, then choose: with few components, one
     # batched matrix product is faster than gathering a 6x6 factor per draw.
-    arm = jnp.einsum("...kij,s...j->s...ki", self.scale_tril, noise) + self.loc[None]
-    arm = jnp.sum(chosen[..., None] * arm, axis=-2)
-    probability = jnp.sum(chosen * jnp.asarray(self.gripper.probs)[None], axis=-1)
+    arm = jnp.einsum("...kij,...sj->...ski", self.scale_tril, noise)
+    arm = jnp.sum(chosen[..., None] * (arm + self.loc[..., None, :, :]), axis=-2)
+    probability = jnp.sum(
+      chosen * jnp.asarray(self.gripper.probs)[..., None, :], axis=-1
+    )
     gripper = (uniform[1] < probability).astype(dtype)
-    return jnp.concatenate([arm, gripper[..., None]], axis=-1)
+    return jnp.moveaxis(jnp.concatenate([arm, gripper[..., None]], axis=-1), -2, 0)
 
   def log_prob(self, value: Float[Array, "*sb d+1"]) -> Float[Array, "*sb"]:
     """Returns the log density of unclipped actions."""
-    arm, gripper = value[..., :-1], value[..., -1]
-    dim = arm.shape[-1]
-    lead = (None,) * (value.ndim - self.logits.ndim)  # Adds the sample axes.
+    batch = self.logits.shape[:-1]
+    lead = value.shape[: value.ndim - 1 - len(batch)]
+    # Move the samples behind the batch, as batched matrix products want them.
+    samples = jnp.moveaxis(value.reshape(-1, *batch, value.shape[-1]), 0, -2)
+    arm, gripper = samples[..., None, :, :-1], samples[..., None, :, -1]
     # Invert the factor once per component instead of solving once per sample.
     whitener = _invert_lower(self.scale_tril)
-    difference = arm[..., None, :] - self.loc[lead]
-    white = jnp.einsum("...kij,...kj->...ki", whitener, difference)
-    constant = -_half_log_det(self.scale_tril) - 0.5 * dim * _LOG_2PI
-    gaussian = constant[lead] - 0.5 * jnp.sum(jnp.square(white), axis=-1)
-    odds = self.gripper_logits[lead]
-    bernoulli = gripper[..., None] * odds - jax.nn.softplus(odds)
-    log_weights = jnp.asarray(self.choice.logits)[lead]
-    return jax.nn.logsumexp(log_weights + gaussian + bernoulli, axis=-1)
+    white = jnp.einsum("...ij,...sj->...si", whitener, arm - self.loc[..., None, :])
+    constant = -_half_log_det(self.scale_tril) - 0.5 * arm.shape[-1] * _LOG_2PI
+    gaussian = constant[..., None] - 0.5 * jnp.sum(jnp.square(white), axis=-1)
+    odds = self.gripper_logits[..., None]
+    bernoulli = gripper * odds - jax.nn.softplus(odds)
+    log_weights = jnp.asarray(self.choice.logits)[..., None]
+    total = jax.nn.logsumexp(log_weights + gaussian + bernoulli, axis=-2)
+    return jnp.moveaxis(total, -1, 0).reshape(*lead, *batch)
 
   def entropy(self) -> Float[Array, "*b"]:
     """Returns the entropy of one component in nats; several have no closed form."""

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 
 from apnpql_jax.agents import learner
+from apnpql_jax.agents.layers import PRODUCTS
 from apnpql_jax.agents.learner import Agent, make_agent
 from apnpql_jax.agents.networks import Heads, Networks, Params, make_networks
 from apnpql_jax.config.schema import AgentConfig, TrainConfig
@@ -95,8 +96,9 @@ class ForgetfulHeads(Heads):
 
   observation: Observation
 
-  def z(self, actions: Array) -> Array:
+  def z(self, actions: Array, *, precision: str = "float32") -> Array:
     """See ``Heads.z``; takes one candidate at a time to save memory."""
+    product = PRODUCTS[precision]
 
     def one(action: Array) -> Array:
       # Never true, because actions are bounded. The compiler cannot see that, and
@@ -104,7 +106,8 @@ class ForgetfulHeads(Heads):
       flip = jnp.any(action > 2.0)
       seen = jax.tree.map(lambda x: jnp.where(flip, 0 * x, x), self.observation)
       phi = self.networks.apply("encoder", self.params, seen)
-      return self.networks.apply("z", self.params, phi, action[None])[0]
+      inputs = phi, action[None]
+      return self.networks.apply("z", self.params, *inputs, product=product)[0]
 
     return jax.lax.map(one, actions)
 

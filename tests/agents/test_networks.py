@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 from typing import Any
 
+from flax import linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,8 +15,10 @@ from scipy import ndimage, special
 
 from apnpql_jax.agents import encoder
 from apnpql_jax.agents.columns.policy_evaluation import Categorical
+from apnpql_jax.agents.layers import PositionwiseDense
 from apnpql_jax.agents.mixture_head import mixture_from_outputs, one_way_clip
 from apnpql_jax.agents.networks import GROUPS, Heads, Networks, make_networks
+from apnpql_jax.agents.table_one import algorithm_of
 from apnpql_jax.config.checks import IMAGE_FEATURES
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.types import Observation
@@ -81,6 +84,24 @@ def test_pixel_encoder_is_two_convolutions(shape: tuple[int, int], overlap: bool
   np.testing.assert_allclose(flat, expected, rtol=1e-4, atol=1e-5)
   expected = np.concatenate([expected_positions(x) for x in (first, second)], axis=-1)
   np.testing.assert_allclose(points, expected, atol=1e-4)
+
+
+def test_a_positionwise_layer_is_the_dense_layer_of_flax():
+  x = jnp.asarray(np.random.default_rng(0).normal(size=(2, 3, 5, 7)), jnp.float32)
+  ours, theirs = PositionwiseDense(6, input_scale=0.5), nn.Dense(6)
+  params = theirs.init(jax.random.key(0), x)
+  np.testing.assert_array_equal(
+    ours.init(jax.random.key(0), x)["params"]["kernel"], params["params"]["kernel"]
+  )
+
+  def loss(module: nn.Module, scale: float, params: Any, x: jax.Array) -> jax.Array:
+    out: Any = module.apply(params, scale * x)
+    return jnp.sum(jnp.sin(out))
+
+  expected = jax.value_and_grad(loss, (2, 3))(theirs, 0.5, params, x)
+  found = jax.value_and_grad(loss, (2, 3))(ours, 1.0, params, x)
+  for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+    np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
 
 
 def test_residual_blocks_start_as_the_identity_and_add_convolutions():
@@ -268,6 +289,27 @@ def test_value_head_is_a_plain_network_of_features_and_action():
   expected = x @ z["out"]["kernel"] + z["out"]["bias"]
   ours = Heads(networks, params, phi).z(actions)
   np.testing.assert_allclose(ours, expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("algorithm", ["ap_npql", "sac"])
+def test_bfloat16_candidates_have_nearly_the_values_of_float32(algorithm: str):
+  config = dataclasses.replace(CONFIG, algorithm=algorithm, hidden=(64, 64))
+  evaluation = algorithm_of(config).policy_evaluation(config)
+  head = evaluation.head(config.hidden)
+  networks = make_networks(config, ("encoder", "z"), head, evaluation.value)
+  seen = observation(4, pixels=False)
+  params = networks.init(jax.random.key(0), seen)
+  # Spread the values as training does; fresh heads value all actions alike.
+  rng = np.random.default_rng(0)
+  params["z"] = jax.tree.map(
+    lambda x: x + jnp.asarray(0.2 * rng.normal(size=x.shape), x.dtype), params["z"]
+  )
+  heads = networks.at(params, seen)
+  actions = jnp.asarray(rng.uniform(-1.0, 1.0, (30, 4, 7)), jnp.float32)
+  exact = heads.q(actions)
+  rounded = networks.value(heads.z(actions, precision="bfloat16"))
+  error, spread = jnp.abs(rounded - exact), jnp.ptp(exact)
+  assert 0.0 < error.max() < 0.01 * spread
 
 
 def test_fresh_networks_predict_the_configured_start():

@@ -31,7 +31,7 @@ class KnownValues(Heads):
 
   goal: float = 0.5
 
-  def z(self, actions):
+  def z(self, actions, *, precision="float32"):
     far = jnp.sum(jnp.square(actions[..., :6] - self.goal), axis=-1)
     return (1.0 - far + 0.5 * actions[..., 6])[..., None]
 

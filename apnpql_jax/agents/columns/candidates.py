@@ -55,7 +55,7 @@ def score(
 ) -> tuple[Float[Array, " s *b 7"], Float[Array, " s *b n"], Float[Array, " s *b"]]:
   """Returns clipped actions, the outputs of the value head, and Q."""
   actions = clip_action(samples)
-  outputs = heads.z(actions)
+  outputs = heads.z(actions, precision=heads.config.candidate_precision)
   return actions, outputs, heads.networks.value(outputs)
 
 
