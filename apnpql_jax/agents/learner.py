@@ -156,6 +156,7 @@ def make_optimizer(
   return optax.partition({k: adam(rates[k]) for k in labels.values()}, labels)
 
 
+@jax.named_scope("apply_gradients")
 def apply_gradients(
   optimizer: optax.GradientTransformation,
   state: LearnerState,
@@ -176,6 +177,7 @@ def apply_gradients(
   return LearnerState(params, target_params, nu, opt_state, state.step + 1)
 
 
+@jax.named_scope("bellman_target")
 def bellman_target(
   networks: Networks,
   algorithm: Algorithm,
@@ -195,6 +197,7 @@ def bellman_target(
   return evaluation.target(policy_at, batch)
 
 
+@jax.named_scope("total_loss")
 def total_loss(
   networks: Networks,
   algorithm: Algorithm,
