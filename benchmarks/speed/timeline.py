@@ -26,6 +26,7 @@ from benchmarks.speed import learner
 Result = dict[str, Any]
 
 _OPERATION = re.compile(r'%([\w.-]+) = .*metadata=\{[^}]*op_name="([^"]*)"')
+# Names within the paths of operations: scopes of the learner, modules, functions of JAX.
 _STEPS = ("augment", "bellman_target", "total_loss", "apply_gradients")
 _MODULES = ("global_image", "wrist_image", "Encoder", "ValueHead", "MLP")
 _RANDOM = ("normal", "uniform", "threefry")
@@ -54,11 +55,11 @@ def measure_all(config: TrainConfig, args: argparse.Namespace) -> Iterator[Resul
   ready = learner.prepare(agent, noise.transitions(config))
   updates = ready.units * args.repeats
   times = timing.measure({"": ready}, repeats=args.repeats)[""]
-  parts: collections.Counter[str] = collections.Counter()
+  parts: dict[str, float] = collections.defaultdict(float)
   for operation, seconds in traced(ready, args.repeats):
     parts[part_of(operation)] += seconds
   total = sum(parts.values())
-  for part, seconds in parts.most_common():
+  for part, seconds in sorted(parts.items(), key=lambda item: -item[1]):
     yield {"part": part, "ms": 1e3 * seconds / updates, "share": seconds / total}
   yield {"part": "an update, by the clock", "ms": 1e3 * times.seconds}
 
