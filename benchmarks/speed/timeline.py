@@ -26,7 +26,7 @@ from benchmarks.speed import learner
 Result = dict[str, Any]
 
 _OPERATION = re.compile(r'%([\w.-]+) = .*metadata=\{[^}]*op_name="([^"]*)"')
-# Names within the paths of operations: scopes of the learner, modules, functions of JAX.
+# Parts of the names of operations: scopes of the learner, modules, functions of JAX.
 _STEPS = ("augment", "bellman_target", "total_loss", "apply_gradients")
 _MODULES = ("global_image", "wrist_image", "Encoder", "ValueHead", "MLP")
 _RANDOM = ("normal", "uniform", "threefry")
