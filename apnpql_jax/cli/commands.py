@@ -22,9 +22,9 @@ from apnpql_jax.cli.options import (
 from apnpql_jax.config import files
 from apnpql_jax.config.checks import BACKENDS
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
+from apnpql_jax.console import print_line
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs import run_folder
-from apnpql_jax.runs.console import print_line
 
 if TYPE_CHECKING:
   from jax.sharding import Mesh

@@ -16,8 +16,8 @@ from apnpql_jax.cli import commands, options
 from apnpql_jax.cli.commands import Json
 from apnpql_jax.cli.options import Train, parse
 from apnpql_jax.config import files
+from apnpql_jax.console import print_line, reporting
 from apnpql_jax.errors import ConfigError, UserError, check_name
-from apnpql_jax.runs.console import print_line, reporting
 from apnpql_jax.runs.signals import Signals
 
 

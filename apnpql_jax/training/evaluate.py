@@ -18,10 +18,10 @@ from apnpql_jax import devices
 from apnpql_jax.agents.learner import Agent, LearnerState, make_agent
 from apnpql_jax.config.checks import ACTING, check_env
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
+from apnpql_jax.console import print_line, reporting
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs import checkpoint_reader, leaves, run_folder
-from apnpql_jax.runs.console import print_line, reporting
 from apnpql_jax.runs.metrics import wilson_interval
 from apnpql_jax.training.rollout import (
   Episodes,

@@ -19,12 +19,12 @@ from apnpql_jax.agents import table_one
 from apnpql_jax.agents.learner import Agent, make_agent
 from apnpql_jax.config import codec
 from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.console import print_line
 from apnpql_jax.data import demonstrations, replay
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.errors import ConfigError, RunStopped
 from apnpql_jax.runs import checkpoint_reader, leaves, provenance, run_folder
 from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
-from apnpql_jax.runs.console import print_line
 from apnpql_jax.runs.metrics import MetricWriter
 from apnpql_jax.runs.progress import TrainProgress
 from apnpql_jax.runs.signals import Signals

@@ -20,9 +20,9 @@ import pytest
 from scipy import stats
 from tensorboardX.proto import event_pb2
 
+from apnpql_jax.console import print_line
 from apnpql_jax.errors import UserError
 from apnpql_jax.runs import metrics
-from apnpql_jax.runs.console import print_line
 from apnpql_jax.runs.progress import TrainProgress
 from apnpql_jax.runs.sinks import check_sinks, make_sinks
 
