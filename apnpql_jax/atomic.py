@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, in folders checked beforehand."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ from collections.abc import Generator
 import contextlib
 import os
 from pathlib import Path
+import tempfile
+
+from apnpql_jax.errors import FileError
 
 
 @contextlib.contextmanager
@@ -28,3 +31,17 @@ def replacing(path: Path) -> Generator[Path, None, None]:
   except BaseException:
     part.unlink(missing_ok=True)
     raise
+
+
+def check_writable(folder: Path) -> None:
+  """Checks that files can be made in a folder or, if it is missing, that it can be.
+
+  Raises:
+    FileError: They cannot; nothing is left behind.
+  """
+  try:
+    found = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    with tempfile.TemporaryFile(dir=found):
+      pass
+  except OSError as error:
+    raise FileError(f"cannot write to {str(folder)!r}: {error.strerror}") from None

@@ -6,6 +6,7 @@ help and errors are fast.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +21,7 @@ from apnpql_jax.cli.options import (
   Train,
 )
 from apnpql_jax.config import files
-from apnpql_jax.config.checks import BACKENDS
+from apnpql_jax.config.checks import BACKENDS, validate
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.console import print_line
 from apnpql_jax.errors import ConfigError, check_name
@@ -47,22 +48,26 @@ def base_config(args: Train) -> TrainConfig:
 def train(args: Train) -> Json:
   """Trains or resumes a run and returns its summary."""
   config, resume = _with_shortcuts(args), args.resume is not None
-  run_dir = args.resume or args.run or run_folder.new_run_dir(args.preset)
-  # ``run_training`` repeats this; here it is fast, because JAX is not imported yet.
-  run_folder.check_start(run_dir, config, resume=resume, overwrite=args.overwrite)
-  mesh = _mesh(args)
+  with contextlib.ExitStack() as stack:
+    run_dir = args.resume or args.run
+    if run_dir is None:
+      validate(config)
+      run_dir = stack.enter_context(run_folder.new_run_dir(args.preset))
+    # ``run_training`` repeats this; here it is fast, because JAX is not imported yet.
+    run_folder.check_start(run_dir, config, resume=resume, overwrite=args.overwrite)
+    mesh = _mesh(args)
 
-  from apnpql_jax import devices
-  from apnpql_jax.training.train import train as run_training
+    from apnpql_jax import devices
+    from apnpql_jax.training.train import train as run_training
 
-  summary = run_training(
-    config,
-    run_dir,
-    resume=resume,
-    overwrite=args.overwrite,
-    mesh=mesh,
-    handle_signals=True,
-  )
+    summary = run_training(
+      config,
+      run_dir,
+      resume=resume,
+      overwrite=args.overwrite,
+      mesh=mesh,
+      handle_signals=True,
+    )
   return summary if devices.is_primary() else {}
 
 

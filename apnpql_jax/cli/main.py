@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with reporting("print the result"):
           write(json.dumps(_plain(result)) if parsed.json else _show(result))
     return 0
-  except UserError as error:
+  except (UserError, OSError) as error:  # Errors of the file system name the path.
     print_line(f"apnpql: {' '.join(str(error).split())}")
     return 2
   except errors.RunStopped as stop:

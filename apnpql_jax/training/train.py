@@ -84,7 +84,9 @@ def train(
     f"stopped before the first iteration; {hint if resume else 'nothing is saved'}"
   )
   with signals if handle_signals else contextlib.nullcontext():
-    start = _start(config, run_dir, mesh, resume=resume, overwrite=overwrite)
+    reserved = run_folder.reserve(run_dir) if devices.is_primary() else None
+    with reserved or contextlib.nullcontext():
+      start = _start(config, run_dir, mesh, resume=resume, overwrite=overwrite)
     _print_line(f"run folder {start.path}; compiling, which can take minutes")
     try:
       state, evaluation = _run(config, start, signals)

@@ -78,6 +78,8 @@ BAD_INPUT = [
   ("train push_plate --run .", ["not a run", "--run"]),
   ("train push_plate --run . --overwrite", ["not a run", "--run"]),
   ("train push_plate --run runs/old/config.json", ["not a folder"]),
+  ("train push_plate --run runs/old/config.json/x", ["cannot write", "config.json"]),
+  (f"train push_plate --run {256 * 'x'}", ["File name too long"]),
   ("train push_plate --run runs/old --overwrite --env.task juggle", ["push_plate"]),
   ("train push_plate --resume runs/old --seed 9", ["seed 0 -> 9"]),
   ("train --resume runs/old --agent.gamma 0.9", ["agent.gamma 0.99 -> 0.9"]),

@@ -83,6 +83,20 @@ def test_a_run_that_cannot_start_builds_and_writes_nothing(
   assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.parametrize("resume", [False, True])
+def test_a_second_start_in_one_folder_builds_nothing(tmp_path, monkeypatch, resume):
+  """The first one has reserved the folder after the second one checked it."""
+  monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # Of the banks.
+  run = tmp_path / "run"
+  if resume:
+    run_folder.create(run, testing.TINY)
+  monkeypatch.setattr(run_folder, "check_start", lambda *_, **__: None)
+  with run_folder.reserve(run):
+    with pytest.raises(FileError, match="is being trained by another process"):
+      train(testing.TINY, run, resume=resume)
+  assert run.exists() == resume and not (tmp_path / "cache").exists()
+
+
 def test_only_the_main_thread_can_be_asked_to_handle_signals(tmp_path):
   with pytest.raises(ConfigError, match="main thread"):
     in_thread(lambda: train(CONFIG, tmp_path / "run", handle_signals=True))
