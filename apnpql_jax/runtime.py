@@ -11,10 +11,12 @@ import contextlib
 import gc
 from importlib import metadata
 import io
+import multiprocessing
 import os
 from pathlib import Path
 import re
 import sys
+import threading
 from typing import Any
 
 from apnpql_jax.errors import UserError
@@ -125,6 +127,21 @@ def _cpu_devices() -> int:
   found = re.search(flag, os.environ.get("XLA_FLAGS", ""))
   text = found[1] if found else os.environ.get("JAX_NUM_CPU_DEVICES", "")
   return max(1, int(text)) if text.isdigit() else 1
+
+
+def end_with_parent() -> None:
+  """Ends this worker process of ``multiprocessing`` as soon as its parent has died.
+
+  Call it first thing in the worker. A killed parent cannot end its workers itself.
+  """
+  parent = multiprocessing.parent_process()
+
+  def wait() -> None:
+    if parent is not None:
+      parent.join()
+      os._exit(1)
+
+  threading.Thread(target=wait, daemon=True).start()
 
 
 def cores() -> int:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import concurrent.futures
+from concurrent.futures.process import BrokenProcessPool
 import dataclasses
 import functools
 import hashlib
@@ -15,6 +16,7 @@ import json
 import multiprocessing
 import os
 import pathlib
+import sys
 import tempfile
 import time
 from typing import Any
@@ -26,9 +28,10 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.console import Unfailing
+from apnpql_jax.errors import ConfigError, UserError
 from apnpql_jax.primitives import ik
-from apnpql_jax.runtime import cache_dir, cores
+from apnpql_jax.runtime import cache_dir, cores, end_with_parent
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.sim.native import NativePhysics
@@ -106,16 +109,18 @@ def build_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
 
   Raises:
     ConfigError: Too many draws were rejected.
+    UserError: A worker process died.
   """
   began = time.monotonic()
   rng = np.random.default_rng(SEED)
   report = BankReport()
   kept: list[ResetBank] = []
+  unfailing: Any = Unfailing(sys.stderr)
   # Spawn, because forking a process in which XLA threads run can deadlock.
   context = multiprocessing.get_context("spawn")
   with (
-    concurrent.futures.ProcessPoolExecutor(cores(), context) as pool,
-    Progress(console=Console(stderr=True)) as progress,
+    concurrent.futures.ProcessPoolExecutor(cores(), context, end_with_parent) as pool,
+    Progress(console=Console(file=unfailing)) as progress,
   ):
     bar = progress.add_task(f"reset bank of {task.name}", total=rows)
     while (missing := rows - sum(bank.rows for bank in kept)) > 0:
@@ -167,9 +172,15 @@ def _solve_targets(
   arrays = starts, positions, rotations
   chunks = [np.split(x, range(CHUNK, len(x), CHUNK)) for x in arrays]
   solved = []
-  for result in pool.map(ik.solve_all, *chunks):
-    solved.append(result)
-    advance(len(result[0]))
+  try:
+    for result in pool.map(ik.solve_all, *chunks):
+      solved.append(result)
+      advance(len(result[0]))
+  except BrokenProcessPool:
+    raise UserError(
+      "a worker process for the reset bank died; free some memory, and keep the "
+      'guard `if __name__ == "__main__":` in a script'
+    ) from None
   targets, residuals = map(np.concatenate, zip(*solved, strict=True))
   reached = (residuals < [ik.POSITION_TOLERANCE, ik.ROTATION_TOLERANCE]).all((1, 2))
   reached &= np.abs(targets - starts[:, None]).max((1, 2)) < MAX_TRAVEL

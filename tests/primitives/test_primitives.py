@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
+import time
+
 from hand_made import SLOW_MJX
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from apnpql_jax import testing
 from apnpql_jax.primitives import ik, reset_bank, tracking
 from apnpql_jax.sim import arm, physics
 from apnpql_jax.sim.kinematics import make_kinematics
@@ -66,6 +73,47 @@ def test_bank_rejects_overlapping_and_unreachable_draws(capsys):
   assert (spots[..., 0] < 0.6).all()
   printed = " ".join(capsys.readouterr().err.split())
   assert "64 drawn; rejected: 22 not at rest, 22 out of reach" in printed
+
+
+BUILD = """
+import multiprocessing, threading, time
+from apnpql_jax.primitives.reset_bank import build_bank
+from apnpql_jax.tasks import make_task
+
+def report():
+  while not multiprocessing.active_children():
+    time.sleep(0.01)
+  print(multiprocessing.active_children()[0].pid, flush=True)
+
+threading.Thread(target=report, daemon=True).start()
+build_bank(make_task("push_plate"), 128)
+"""
+
+
+def _build() -> tuple[subprocess.Popen[str], int]:
+  """Returns a new process that builds a bank, and the pid of one of its workers."""
+  command, pipe = [sys.executable, "-c", BUILD], subprocess.PIPE
+  process = subprocess.Popen(
+    command, stdout=pipe, stderr=pipe, text=True, cwd=testing.ROOT
+  )
+  assert process.stdout is not None
+  return process, int(process.stdout.readline())
+
+
+@pytest.mark.parametrize("delay", [0.0, 1.5], ids=["starting", "working"])
+def test_workers_end_with_a_killed_process(delay):
+  process, _ = _build()
+  time.sleep(delay)
+  process.kill()
+  process.communicate(timeout=20)  # Ends with the last process that holds the pipe.
+
+
+def test_a_killed_worker_ends_the_build_with_one_line():
+  process, worker = _build()
+  os.kill(worker, signal.SIGKILL)
+  _, shown = process.communicate(timeout=60)
+  assert process.returncode == 1
+  assert "UserError: a worker process for the reset bank died" in shown
 
 
 def test_refinement_agrees_with_mink(task, small_bank):
