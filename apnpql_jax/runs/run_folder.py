@@ -29,7 +29,8 @@ _PATTERN = "*?[]\\"
 
 MAY_CHANGE = (
   "total_steps eval_every eval_episodes eval_acting checkpoint_every "
-  "keep_checkpoints save_replay_every max_skipped_updates video sinks"
+  "keep_checkpoints save_replay_every max_skipped_updates video sinks "
+  "wandb_project wandb_entity wandb_id"
 ).split()
 """Settings that a resumed run may change, because they do not affect learning."""
 

@@ -144,7 +144,8 @@ def _run(
         print_line(f"later checkpoints and a copy of the metrics were moved to {aside}")
     devices.barrier()
     if devices.is_primary():
-      sinks = make_sinks(config.sinks, path, dict(codec.flatten(config)))
+      settings = dict(codec.flatten(config))
+      sinks = make_sinks(config.sinks, path, settings, resume_step=resume_step)
       writer = MetricWriter(path, resume_step=resume_step, sinks=sinks)
       stack.enter_context(writer)
       progress = stack.enter_context(TrainProgress(config.total_steps))
