@@ -24,7 +24,7 @@ def replacing(path: Path) -> Generator[Path, None, None]:
   if path.exists() and not path.is_file():
     yield path
     return
-  part = path.with_stem(f"{path.stem}.part")
+  part = path.with_stem(f"{path.stem}.part{os.getpid()}")
   try:
     yield part
     os.replace(part, path)

@@ -19,6 +19,8 @@ import sys
 import threading
 from typing import Any
 
+from apnpql_jax.atomic import check_writable
+from apnpql_jax.console import print_line
 from apnpql_jax.errors import UserError
 
 MIN_THREADS = 4  # XLA:CPU threads per emulated device, which share a pool
@@ -37,8 +39,9 @@ def configure() -> None:
   """
   wanted = _threads() | _fusions()
   changed = {k: value for k, value in wanted.items() if os.environ.get(k) != value}
-  settings = {
-    "jax_compilation_cache_dir": str(cache_dir() / "xla"),
+  cache = _xla_cache()
+  settings: dict[str, Any] = {"jax_compilation_cache_dir": cache} if cache else {}
+  settings |= {
     # Below JAX's default are programs that together delay each start by a second.
     "jax_persistent_cache_min_compile_time_secs": 0.2,
     # By default XLA multiplies f32 matrices in TF32 (10 bits of mantissa) on GPUs. Mass
@@ -70,11 +73,32 @@ def collect_garbage_less_often() -> None:
   gc.set_threshold(50_000, 20, 20)
 
 
-def cache_dir() -> Path:
-  """Returns the user's cache folder of this package, which may not exist yet."""
+def cache_dir() -> Path | None:
+  """Returns the user's cache folder of this package, which may not exist yet.
+
+  None if the user has no home.
+  """
   root = os.environ.get("XDG_CACHE_HOME", "")
-  base = Path(root) if os.path.isabs(root) else Path.home() / ".cache"
-  return base / "apnpql_jax"
+  if os.path.isabs(root):
+    return Path(root) / "apnpql_jax"
+  try:
+    return Path.home() / ".cache" / "apnpql_jax"
+  except RuntimeError:
+    return None
+
+
+def _xla_cache() -> str | None:
+  """Returns the folder for compiled programs; prints a line if there is none."""
+  if given := os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+    return given
+  try:
+    if (cache := cache_dir()) is None:
+      raise UserError("you have no home folder")
+    check_writable(cache / "xla")
+    return str(cache / "xla")
+  except UserError as error:
+    print_line(f"{error}; compiled programs are not kept (set XDG_CACHE_HOME)")
+    return None
 
 
 @contextlib.contextmanager

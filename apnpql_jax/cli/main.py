@@ -28,8 +28,6 @@ def main(argv: Sequence[str] | None = None) -> int:
   130 Ctrl-C and 143 SIGTERM, with the run saved. All but 0 print one line to stderr.
   """
   _fill_closed_streams()
-  runtime.configure()
-  runtime.collect_garbage_less_often()
   args = list(sys.argv[1:] if argv is None else argv)
   try:
     if not args:
@@ -41,6 +39,8 @@ def main(argv: Sequence[str] | None = None) -> int:
       _print(__version__)
       return 0
     check_name("command", args[0], list(_COMMANDS))
+    runtime.configure()
+    runtime.collect_garbage_less_often()
     kind, command = _COMMANDS[args[0]]
     parsed = _parse(kind, args)
     with Signals("interrupted"), _json_only(parsed.json) as write:

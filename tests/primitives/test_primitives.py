@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import subprocess
 import sys
 import time
+from typing import Any
 
 from hand_made import SLOW_MJX
 import jax
@@ -32,6 +34,40 @@ def small_bank(task, tmp_path_factory):
   jax.tree.map(np.testing.assert_array_equal, built[0], again[0])
   assert built[1] == again[1]
   return built
+
+
+def test_a_damaged_or_foreign_bank_is_built_again(task, tmp_path, monkeypatch, capfd):
+  monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+  os.umask(umask := os.umask(0))
+  expected, _ = reset_bank.load_bank(task, 16)
+  (path,) = (tmp_path / "apnpql_jax" / "banks").iterdir()
+  assert path.stat().st_mode & 0o777 == 0o666 & ~umask  # Others may read it.
+  whole = path.read_bytes()
+  others, broken = io.BytesIO(), io.BytesIO()
+  np.savez(others, report="{}", qpos=np.zeros(16))
+  nans = np.full((16, 3, 6), np.nan, np.float32)
+  arrays: dict[str, Any] = dict(np.load(io.BytesIO(whole))) | {"targets": nans}
+  np.savez(broken, **arrays)
+  flipped = bytearray(whole)
+  flipped[len(whole) // 2] ^= 1
+  damages = b"", b"text", whole[:-100], bytes(flipped), others.getvalue()
+  for damage in (*damages, broken.getvalue()):
+    path.write_bytes(damage)
+    capfd.readouterr()
+    bank, _ = reset_bank.load_bank(task, 16)
+    jax.tree.map(np.testing.assert_array_equal, bank, expected)
+    assert capfd.readouterr().err.count("cannot be used and is built again: ") == 1
+  reset_bank.load_bank(task, 16)
+  assert capfd.readouterr().err == ""
+
+
+def test_a_bank_that_cannot_be_kept_costs_one_line(task, tmp_path, monkeypatch, capfd):
+  (tmp_path / "apnpql_jax").mkdir()
+  (tmp_path / "apnpql_jax" / "banks").write_text("a file")
+  monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+  bank, _ = reset_bank.load_bank(task, 16)
+  assert bank.rows == 16
+  assert capfd.readouterr().err.count("cannot keep the reset bank: ") == 1
 
 
 def test_bank_targets_reach_their_poses(task, small_bank):
