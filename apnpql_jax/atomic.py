@@ -33,6 +33,23 @@ def replacing(path: Path) -> Generator[Path, None, None]:
     raise
 
 
+def check_utf8(path: Path) -> None:
+  """Checks that C libraries, which take paths as UTF-8, find the same file as Python.
+
+  Raises:
+    FileError: They do not, because of the locale or of the bytes of a name.
+  """
+  name = str(path.absolute())
+  try:
+    same = os.fsencode(name) == name.encode()
+  except UnicodeEncodeError:
+    same = False
+  if not same:
+    raise FileError(
+      f"{name!a} is not UTF-8, or the locale is not; set LC_ALL=C.UTF-8, or rename it"
+    )
+
+
 def check_writable(folder: Path) -> None:
   """Checks that files can be made in a folder or, if it is missing, that it can be.
 

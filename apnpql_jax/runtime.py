@@ -27,6 +27,13 @@ MIN_THREADS = 4  # XLA:CPU threads per emulated device, which share a pool
 # Operations that XLA:CPU runs in the library YNNPACK; its default adds "REDUCE".
 KEPT_FUSIONS = "INDIVIDUAL_CONVOLUTION", "INDIVIDUAL_DOT"
 # The flag and the jaxlib versions that have it; XLA aborts on unknown flags.
+_UNSUPPORTED = {
+  "jax_enable_x64": ("1", "true", "t", "yes", "y", "on"),
+  "jax_numpy_rank_promotion": ("raise",),
+  "jax_numpy_dtype_promotion": ("strict",),
+}
+"""Settings of JAX and their values under which this package or MJX fails."""
+
 _JAX_DEFAULTS = None, 1.0  # of the settings below
 _FLAG, _FLAG_VERSIONS = "xla_cpu_experimental_ynn_fusion_type", r"0\.1[01]\."
 
@@ -35,8 +42,14 @@ def configure() -> None:
   """Sets threads, XLA flags, cache and precision; must run before JAX runs anything.
 
   Raises:
-    UserError: JAX has run something, so a setting that is missing would have no effect.
+    UserError: JAX has run something, so a setting that is missing would have no effect;
+      or JAX has a setting that this package does not support.
   """
+  jax: Any = sys.modules.get("jax")
+  for name, refused in _UNSUPPORTED.items():
+    given = getattr(jax.config, name) if jax else os.environ.get(name.upper(), "")
+    if str(given).lower() in refused:
+      raise UserError(f"{name.upper()}={given} is not supported; unset it")
   wanted = _threads() | _fusions()
   changed = {k: value for k, value in wanted.items() if os.environ.get(k) != value}
   cache = _xla_cache()
@@ -48,7 +61,6 @@ def configure() -> None:
     # matrices, forward kinematics and so contacts would lose three digits.
     "jax_default_matmul_precision": "highest",
   }
-  jax: Any = sys.modules.get("jax")
   bridge: Any = sys.modules.get("jax._src.xla_bridge")
   unset = [k for k in settings if jax and getattr(jax.config, k, None) in _JAX_DEFAULTS]
   if (changed or unset) and bridge and bridge.backends_are_initialized():
@@ -120,7 +132,7 @@ def _threads() -> dict[str, str]:
   # pool of two, two such calls deadlock (seen from 128 worlds on); in a pool of four
   # they do not. XLA sizes the pool by these variables or the number of cores.
   minimum = MIN_THREADS * _cpu_devices()
-  given = [x for x in ("PJRT_NPROC", "NPROC") if os.environ.get(x, "").isdigit()]
+  given = [x for x in ("PJRT_NPROC", "NPROC") if os.environ.get(x, "").isdecimal()]
   if not given and cores() < minimum:
     return {"NPROC": str(minimum)}
   return {name: str(max(minimum, int(os.environ[name]))) for name in given}
@@ -150,7 +162,7 @@ def _cpu_devices() -> int:
   flag = r"xla_force_host_platform_device_count=(\d+)"
   found = re.search(flag, os.environ.get("XLA_FLAGS", ""))
   text = found[1] if found else os.environ.get("JAX_NUM_CPU_DEVICES", "")
-  return max(1, int(text)) if text.isdigit() else 1
+  return max(1, int(text)) if text.isdecimal() else 1
 
 
 def end_with_parent() -> None:

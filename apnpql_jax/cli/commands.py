@@ -11,6 +11,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from apnpql_jax.atomic import check_writable
 from apnpql_jax.cli.options import (
   Collect,
   Convert,
@@ -129,9 +130,10 @@ def convert(args: Convert) -> Json:
   _check_demonstrations(Path(args.out), overwrite=args.overwrite)
   env = _task_env(args.task)
 
-  from apnpql_jax import tasks
+  from apnpql_jax import devices, tasks
   from apnpql_jax.data import demonstrations, real_arm
 
+  devices.start()
   scene, period_s = tasks.make_task(args.task).scene, env.control_period_s
   demos = real_arm.convert(Path(args.recording), scene, period_s=period_s)
   return demonstrations.save(
@@ -146,8 +148,10 @@ def repeat(args: Repeat) -> Json:
   path = Path(args.file).absolute()
   run_folder.load_run_config(path.parent.parent, print_line)
 
+  from apnpql_jax import devices
   from apnpql_jax.training import skipped_updates
 
+  devices.start()
   return skipped_updates.repeat(path)
 
 
@@ -158,8 +162,10 @@ def list_names(args: List) -> Json:
 
   names = tasks.task_names()
   if args.contacts:
+    from apnpql_jax import devices
     from apnpql_jax.envs.contact_report import contact_report
 
+    devices.start()
     return {name: contact_report(tasks.make_task(name)) for name in names}
   return {
     "tasks": names,
@@ -210,6 +216,7 @@ def _check_demonstrations(path: Path, *, overwrite: bool) -> None:
   """Raises ``ConfigError`` if demonstrations cannot be written, or must not be."""
   if path.is_dir() or not path.absolute().parent.is_dir():
     raise ConfigError(f"{path} is a folder, or in none; name a file to write")
+  check_writable(path.absolute().parent)
   _check_free(path, overwrite=overwrite)
 
 
@@ -237,7 +244,7 @@ def _checkpoint_step(args: Evaluate | Diagnose) -> int | None:
     from apnpql_jax.runs.checkpoint_reader import best_step
 
     return best_step(Path(args.run))
-  if args.checkpoint.isdigit():
+  if args.checkpoint.isdecimal() and len(args.checkpoint) < 20:
     return int(args.checkpoint)
   raise ConfigError(
     f"unknown --checkpoint {args.checkpoint!r}; choose from newest, best, or a step"

@@ -16,7 +16,7 @@ from apnpql_jax.cli import commands, options
 from apnpql_jax.cli.commands import Json
 from apnpql_jax.cli.options import Train, parse
 from apnpql_jax.config import files
-from apnpql_jax.console import print_line, reporting
+from apnpql_jax.console import Unfailing, print_line, reporting
 from apnpql_jax.errors import ConfigError, UserError, check_name
 from apnpql_jax.runs.signals import Signals
 
@@ -92,13 +92,14 @@ def _json_only(enabled: bool) -> Generator[Callable[[str], Any], None, None]:
   if not enabled:
     yield _print
     return
-  sys.stdout.flush()
+  stream = Unfailing(sys.stdout)
+  stream.flush()
   stdout = os.dup(1)
   os.dup2(2, 1)
   try:
     yield lambda text: os.write(stdout, (text + "\n").encode())
   finally:
-    sys.stdout.flush()
+    stream.flush()
     os.dup2(stdout, 1)
     os.close(stdout)
 

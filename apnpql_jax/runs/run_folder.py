@@ -11,7 +11,7 @@ from pathlib import Path
 import shutil
 from typing import Any, NamedTuple
 
-from apnpql_jax.atomic import check_writable
+from apnpql_jax.atomic import check_utf8, check_writable
 from apnpql_jax.config import files
 from apnpql_jax.config.checks import validate
 from apnpql_jax.config.schema import TrainConfig
@@ -54,6 +54,7 @@ def create(
     FileError: The folder holds a run and ``overwrite`` is not set, it holds anything
       else, or it cannot be created.
   """
+  _check_characters(run_dir, _PATTERN)
   _check_replaceable(run_dir, overwrite=overwrite)
   versions = json.dumps(describe_versions(devices), indent=2) + "\n"
   run_dir = run_dir.absolute()
@@ -253,6 +254,7 @@ def check_free(run_dir: Path, *, overwrite: bool) -> None:
       reserved it or trains its run, it holds anything else, which is never removed, or
       it cannot be written.
   """
+  _check_characters(run_dir, _PATTERN)
   check_writable(run_dir.parent)
   _check_replaceable(run_dir, overwrite=overwrite)
   if run_dir.exists():
@@ -260,8 +262,7 @@ def check_free(run_dir: Path, *, overwrite: bool) -> None:
 
 
 def _check_replaceable(run_dir: Path, *, overwrite: bool) -> None:
-  """Raises ``FileError`` as ``check_free`` does, except for other processes."""
-  _check_characters(run_dir, _PATTERN)
+  """Raises ``FileError`` if there is anything that ``create`` must not replace."""
   if not run_dir.exists():
     return
   if not run_dir.is_dir() or run_dir.is_symlink():
@@ -280,7 +281,8 @@ def _check_replaceable(run_dir: Path, *, overwrite: bool) -> None:
 
 
 def _check_characters(run_dir: Path, refused: str) -> None:
-  """Raises ``FileError`` if the absolute path has any of the refused characters."""
+  """Raises ``FileError`` if the absolute path is not UTF-8 or has such characters."""
+  check_utf8(run_dir)
   path = str(run_dir.absolute())
   if found := sorted(set(path) & set(refused)):
     raise FileError(

@@ -115,6 +115,7 @@ def _check(
   handle_signals: bool,
 ) -> None:
   """Raises ``UserError`` if the run cannot start; see ``train`` for the arguments."""
+  devices.start()
   run_folder.check_start(
     run_dir,
     config,
@@ -173,8 +174,10 @@ def _start(
   overwrite: bool,
 ) -> Start:
   """Builds or restores everything; creates the run folder last."""
-  # Orbax logs a traceback per thread when a save fails; the run reports it in one line.
-  logging.getLogger("absl").setLevel(logging.CRITICAL)
+  # Orbax and its abandoned tasks log pages of tracebacks when a save fails; the run
+  # reports it in one line.
+  for name in ("absl", "asyncio"):
+    logging.getLogger(name).setLevel(logging.CRITICAL)
   count = mesh.size if mesh else 1
   if resume:
     path = run_folder.open_run(run_dir).path
@@ -184,8 +187,8 @@ def _start(
   if saved:
     checkpoint_reader.restore(run_dir, None, {}, config=config)  # Fails early.
   fill = None if saved else _expert(config)
+  agent = make_agent(config.agent)  # Before the worlds, which can take minutes.
   env = make_env(config.env, mesh, instants=config.agent.lstm_instants)
-  agent = make_agent(config.agent)
   example = example_state(config, env, agent)
   devices.check_memory(leaves.nbytes(example), "the training state")
   if fill is None:

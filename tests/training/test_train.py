@@ -66,10 +66,16 @@ def changed(**settings: object) -> TrainConfig:
       FileError,
       "none is not an .npz archive",
     ),
+    (
+      changed(env=dataclasses.replace(testing.TINY.env, control_period_s=0.151)),
+      {},
+      ConfigError,
+      "control_period_s=0.151 must be a multiple of the scene's timestep",
+    ),
     (testing.TINY, {"run_dir": "old"}, FileError, "old' holds a run"),
     (changed(seed=1), {"run_dir": "old", "resume": True}, ConfigError, "seed 0 -> 1"),
   ],
-  ids=["settings", "sinks", "demonstrations", "folder", "resume"],
+  ids=["settings", "sinks", "demonstrations", "timestep", "folder", "resume"],
 )
 def test_a_run_that_cannot_start_builds_and_writes_nothing(
   config, options, error, words, tmp_path, monkeypatch
