@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, in folders checked beforehand."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ from collections.abc import Generator
 import contextlib
 import os
 from pathlib import Path
+import tempfile
+
+from apnpql_jax.errors import FileError
 
 
 @contextlib.contextmanager
@@ -21,10 +24,41 @@ def replacing(path: Path) -> Generator[Path, None, None]:
   if path.exists() and not path.is_file():
     yield path
     return
-  part = path.with_stem(f"{path.stem}.part")
+  part = path.with_stem(f"{path.stem}.part{os.getpid()}")
   try:
     yield part
     os.replace(part, path)
   except BaseException:
     part.unlink(missing_ok=True)
     raise
+
+
+def check_utf8(path: Path) -> None:
+  """Checks that C libraries, which take paths as UTF-8, find the same file as Python.
+
+  Raises:
+    FileError: They do not, because of the locale or of the bytes of a name.
+  """
+  name = str(path.absolute())
+  try:
+    same = os.fsencode(name) == name.encode()
+  except UnicodeEncodeError:
+    same = False
+  if not same:
+    raise FileError(
+      f"{name!a} is not UTF-8, or the locale is not; set LC_ALL=C.UTF-8, or rename it"
+    )
+
+
+def check_writable(folder: Path) -> None:
+  """Checks that files can be made in a folder or, if it is missing, that it can be.
+
+  Raises:
+    FileError: They cannot; nothing is left behind.
+  """
+  try:
+    found = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    with tempfile.TemporaryFile(dir=found):
+      pass
+  except OSError as error:
+    raise FileError(f"cannot write to {str(folder)!r}: {error.strerror}") from None

@@ -44,12 +44,26 @@ def join(coordinator: str, processes: int | None, process: int | None) -> None:
     raise ConfigError(f"--coordinator {coordinator}: {one_line(error)}") from None
 
 
+def start() -> list[jax.Device]:
+  """Starts JAX if it has not started, and returns the devices of all processes.
+
+  Raises ``ConfigError`` if the platform that it was asked for has none.
+  """
+  try:
+    return jax.devices()
+  except (RuntimeError, AssertionError) as error:
+    config: Any = jax.config
+    raise ConfigError(
+      f"no device for JAX_PLATFORMS={config.jax_platforms}: {one_line(error)}"
+    ) from None
+
+
 def make_mesh(devices: int) -> Mesh | None:
   """Returns a mesh of the first devices, 0 for all; None for a single device.
 
   Raises ``ConfigError`` if there are fewer devices in all processes.
   """
-  found = jax.devices()
+  found = start()
   if not 0 <= devices <= len(found):
     raise ConfigError(f"--devices {devices} must be within 0 (all) and {len(found)}")
   chosen = found[: devices or None]

@@ -11,18 +11,29 @@ import contextlib
 import gc
 from importlib import metadata
 import io
+import multiprocessing
 import os
 from pathlib import Path
 import re
 import sys
+import threading
 from typing import Any
 
+from apnpql_jax.atomic import check_writable
+from apnpql_jax.console import print_line
 from apnpql_jax.errors import UserError
 
 MIN_THREADS = 4  # XLA:CPU threads per emulated device, which share a pool
 # Operations that XLA:CPU runs in the library YNNPACK; its default adds "REDUCE".
 KEPT_FUSIONS = "INDIVIDUAL_CONVOLUTION", "INDIVIDUAL_DOT"
 # The flag and the jaxlib versions that have it; XLA aborts on unknown flags.
+_UNSUPPORTED = {
+  "jax_enable_x64": ("1", "true", "t", "yes", "y", "on"),
+  "jax_numpy_rank_promotion": ("raise",),
+  "jax_numpy_dtype_promotion": ("strict",),
+}
+"""Settings of JAX and their values under which this package or MJX fails."""
+
 _JAX_DEFAULTS = None, 1.0  # of the settings below
 _FLAG, _FLAG_VERSIONS = "xla_cpu_experimental_ynn_fusion_type", r"0\.1[01]\."
 
@@ -31,19 +42,25 @@ def configure() -> None:
   """Sets threads, XLA flags, cache and precision; must run before JAX runs anything.
 
   Raises:
-    UserError: JAX has run something, so a setting that is missing would have no effect.
+    UserError: JAX has run something, so a setting that is missing would have no effect;
+      or JAX has a setting that this package does not support.
   """
+  jax: Any = sys.modules.get("jax")
+  for name, refused in _UNSUPPORTED.items():
+    given = getattr(jax.config, name) if jax else os.environ.get(name.upper(), "")
+    if str(given).lower() in refused:
+      raise UserError(f"{name.upper()}={given} is not supported; unset it")
   wanted = _threads() | _fusions()
   changed = {k: value for k, value in wanted.items() if os.environ.get(k) != value}
-  settings = {
-    "jax_compilation_cache_dir": str(cache_dir() / "xla"),
+  cache = _xla_cache()
+  settings: dict[str, Any] = {"jax_compilation_cache_dir": cache} if cache else {}
+  settings |= {
     # Below JAX's default are programs that together delay each start by a second.
     "jax_persistent_cache_min_compile_time_secs": 0.2,
     # By default XLA multiplies f32 matrices in TF32 (10 bits of mantissa) on GPUs. Mass
     # matrices, forward kinematics and so contacts would lose three digits.
     "jax_default_matmul_precision": "highest",
   }
-  jax: Any = sys.modules.get("jax")
   bridge: Any = sys.modules.get("jax._src.xla_bridge")
   unset = [k for k in settings if jax and getattr(jax.config, k, None) in _JAX_DEFAULTS]
   if (changed or unset) and bridge and bridge.backends_are_initialized():
@@ -68,11 +85,32 @@ def collect_garbage_less_often() -> None:
   gc.set_threshold(50_000, 20, 20)
 
 
-def cache_dir() -> Path:
-  """Returns the user's cache folder of this package, which may not exist yet."""
+def cache_dir() -> Path | None:
+  """Returns the user's cache folder of this package, which may not exist yet.
+
+  None if the user has no home.
+  """
   root = os.environ.get("XDG_CACHE_HOME", "")
-  base = Path(root) if os.path.isabs(root) else Path.home() / ".cache"
-  return base / "apnpql_jax"
+  if os.path.isabs(root):
+    return Path(root) / "apnpql_jax"
+  try:
+    return Path.home() / ".cache" / "apnpql_jax"
+  except RuntimeError:
+    return None
+
+
+def _xla_cache() -> str | None:
+  """Returns the folder for compiled programs; prints a line if there is none."""
+  if given := os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+    return given
+  try:
+    if (cache := cache_dir()) is None:
+      raise UserError("you have no home folder")
+    check_writable(cache / "xla")
+    return str(cache / "xla")
+  except UserError as error:
+    print_line(f"{error}; compiled programs are not kept (set XDG_CACHE_HOME)")
+    return None
 
 
 @contextlib.contextmanager
@@ -94,7 +132,7 @@ def _threads() -> dict[str, str]:
   # pool of two, two such calls deadlock (seen from 128 worlds on); in a pool of four
   # they do not. XLA sizes the pool by these variables or the number of cores.
   minimum = MIN_THREADS * _cpu_devices()
-  given = [x for x in ("PJRT_NPROC", "NPROC") if os.environ.get(x, "").isdigit()]
+  given = [x for x in ("PJRT_NPROC", "NPROC") if os.environ.get(x, "").isdecimal()]
   if not given and cores() < minimum:
     return {"NPROC": str(minimum)}
   return {name: str(max(minimum, int(os.environ[name]))) for name in given}
@@ -124,7 +162,22 @@ def _cpu_devices() -> int:
   flag = r"xla_force_host_platform_device_count=(\d+)"
   found = re.search(flag, os.environ.get("XLA_FLAGS", ""))
   text = found[1] if found else os.environ.get("JAX_NUM_CPU_DEVICES", "")
-  return max(1, int(text)) if text.isdigit() else 1
+  return max(1, int(text)) if text.isdecimal() else 1
+
+
+def end_with_parent() -> None:
+  """Ends this worker process of ``multiprocessing`` as soon as its parent has died.
+
+  Call it first thing in the worker. A killed parent cannot end its workers itself.
+  """
+  parent = multiprocessing.parent_process()
+
+  def wait() -> None:
+    if parent is not None:
+      parent.join()
+      os._exit(1)
+
+  threading.Thread(target=wait, daemon=True).start()
 
 
 def cores() -> int:

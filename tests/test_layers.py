@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "apnpql_jax"
 NAME = PACKAGE.name
 
 STAIR = (
-  "errors types atomic runtime dists config devices sim render tasks "
+  "errors types atomic console runtime dists config devices sim render tasks "
   "randomization primitives envs agents data runs training testing cli __main__"
 ).split()
 """Rooms from the bottom up: each imports only from itself and from earlier ones."""

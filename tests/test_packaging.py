@@ -125,7 +125,8 @@ def test_lock_satisfies_the_requirements_of_the_project(lock, wanted):
 
 def test_the_workflow_caches_what_the_tests_compile():
   workflow = (ROOT / ".github" / "workflows" / "checks.yml").read_text()
-  assert f"path: {runtime.cache_dir().relative_to(ROOT)}\n" in workflow
+  cache = runtime.cache_dir()
+  assert cache is not None and f"path: {cache.relative_to(ROOT)}\n" in workflow
 
 
 def test_mujoco_and_mjx_are_a_matched_pair():

@@ -127,6 +127,29 @@ def test_cache_is_in_the_cache_folder_of_the_user(tmp_path):
   assert env["JAX_COMPILATION_CACHE_DIR"] == str(expected)
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+def test_without_home_and_passwd_entry_commands_work_but_nothing_is_kept():
+  line = "you have no home folder; compiled programs are not kept (set XDG_CACHE_HOME)"
+  code = (
+    "import os, sys, pwd; sys.stderr = sys.stdout; del os.environ['HOME'];"
+    "from apnpql_jax.cli import commands, main, options;"
+    "commands.list_names(options.List()); os.setuid(54321);"
+    "main.main(['--help']); main.main(['list'])"
+  )
+  _, _, shown = run(code, XDG_CACHE_HOME="").partition("usage: apnpql COMMAND")
+  assert shown.count(line) == 1 and "ap_npql" in shown.partition(line)[2]
+
+
+def test_a_cache_that_cannot_be_written_costs_one_line(tmp_path):
+  (tmp_path / "file").write_text("")
+  code = f"{CONFIGURE}; import jax; print(jax.config.jax_compilation_cache_dir)"
+  report = "import sys; sys.stderr = sys.stdout"
+  shown = run(f"{report}; {code}", XDG_CACHE_HOME=str(tmp_path / "file"))
+  line, cache = shown.splitlines()
+  assert line.startswith(f"cannot write to '{tmp_path}/file/apnpql_jax/xla': Not a dir")
+  assert cache == "None"
+
+
 @pytest.mark.parametrize(
   "order",
   [f"{CONFIGURE}; import jax", f"import jax; {CONFIGURE}"],

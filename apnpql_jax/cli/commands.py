@@ -6,10 +6,12 @@ help and errors are fast.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from apnpql_jax.atomic import check_writable
 from apnpql_jax.cli.options import (
   Collect,
   Convert,
@@ -20,11 +22,11 @@ from apnpql_jax.cli.options import (
   Train,
 )
 from apnpql_jax.config import files
-from apnpql_jax.config.checks import BACKENDS
+from apnpql_jax.config.checks import BACKENDS, validate
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
+from apnpql_jax.console import print_line
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs import run_folder
-from apnpql_jax.runs.console import print_line
 
 if TYPE_CHECKING:
   from jax.sharding import Mesh
@@ -47,22 +49,26 @@ def base_config(args: Train) -> TrainConfig:
 def train(args: Train) -> Json:
   """Trains or resumes a run and returns its summary."""
   config, resume = _with_shortcuts(args), args.resume is not None
-  run_dir = args.resume or args.run or run_folder.new_run_dir(args.preset)
-  # ``run_training`` repeats this; here it is fast, because JAX is not imported yet.
-  run_folder.check_start(run_dir, config, resume=resume, overwrite=args.overwrite)
-  mesh = _mesh(args)
+  with contextlib.ExitStack() as stack:
+    run_dir = args.resume or args.run
+    if run_dir is None:
+      validate(config)
+      run_dir = stack.enter_context(run_folder.new_run_dir(args.preset))
+    # ``run_training`` repeats this; here it is fast, because JAX is not imported yet.
+    run_folder.check_start(run_dir, config, resume=resume, overwrite=args.overwrite)
+    mesh = _mesh(args)
 
-  from apnpql_jax import devices
-  from apnpql_jax.training.train import train as run_training
+    from apnpql_jax import devices
+    from apnpql_jax.training.train import train as run_training
 
-  summary = run_training(
-    config,
-    run_dir,
-    resume=resume,
-    overwrite=args.overwrite,
-    mesh=mesh,
-    handle_signals=True,
-  )
+    summary = run_training(
+      config,
+      run_dir,
+      resume=resume,
+      overwrite=args.overwrite,
+      mesh=mesh,
+      handle_signals=True,
+    )
   return summary if devices.is_primary() else {}
 
 
@@ -124,9 +130,10 @@ def convert(args: Convert) -> Json:
   _check_demonstrations(Path(args.out), overwrite=args.overwrite)
   env = _task_env(args.task)
 
-  from apnpql_jax import tasks
+  from apnpql_jax import devices, tasks
   from apnpql_jax.data import demonstrations, real_arm
 
+  devices.start()
   scene, period_s = tasks.make_task(args.task).scene, env.control_period_s
   demos = real_arm.convert(Path(args.recording), scene, period_s=period_s)
   return demonstrations.save(
@@ -141,8 +148,10 @@ def repeat(args: Repeat) -> Json:
   path = Path(args.file).absolute()
   run_folder.load_run_config(path.parent.parent, print_line)
 
+  from apnpql_jax import devices
   from apnpql_jax.training import skipped_updates
 
+  devices.start()
   return skipped_updates.repeat(path)
 
 
@@ -153,8 +162,10 @@ def list_names(args: List) -> Json:
 
   names = tasks.task_names()
   if args.contacts:
+    from apnpql_jax import devices
     from apnpql_jax.envs.contact_report import contact_report
 
+    devices.start()
     return {name: contact_report(tasks.make_task(name)) for name in names}
   return {
     "tasks": names,
@@ -205,6 +216,7 @@ def _check_demonstrations(path: Path, *, overwrite: bool) -> None:
   """Raises ``ConfigError`` if demonstrations cannot be written, or must not be."""
   if path.is_dir() or not path.absolute().parent.is_dir():
     raise ConfigError(f"{path} is a folder, or in none; name a file to write")
+  check_writable(path.absolute().parent)
   _check_free(path, overwrite=overwrite)
 
 
@@ -232,7 +244,7 @@ def _checkpoint_step(args: Evaluate | Diagnose) -> int | None:
     from apnpql_jax.runs.checkpoint_reader import best_step
 
     return best_step(Path(args.run))
-  if args.checkpoint.isdigit():
+  if args.checkpoint.isdecimal() and len(args.checkpoint) < 20:
     return int(args.checkpoint)
   raise ConfigError(
     f"unknown --checkpoint {args.checkpoint!r}; choose from newest, best, or a step"

@@ -16,8 +16,8 @@ from apnpql_jax.cli import commands, options
 from apnpql_jax.cli.commands import Json
 from apnpql_jax.cli.options import Train, parse
 from apnpql_jax.config import files
+from apnpql_jax.console import Unfailing, print_line, reporting
 from apnpql_jax.errors import ConfigError, UserError, check_name
-from apnpql_jax.runs.console import print_line, reporting
 from apnpql_jax.runs.signals import Signals
 
 
@@ -28,8 +28,6 @@ def main(argv: Sequence[str] | None = None) -> int:
   130 Ctrl-C and 143 SIGTERM, with the run saved. All but 0 print one line to stderr.
   """
   _fill_closed_streams()
-  runtime.configure()
-  runtime.collect_garbage_less_often()
   args = list(sys.argv[1:] if argv is None else argv)
   try:
     if not args:
@@ -41,6 +39,8 @@ def main(argv: Sequence[str] | None = None) -> int:
       _print(__version__)
       return 0
     check_name("command", args[0], list(_COMMANDS))
+    runtime.configure()
+    runtime.collect_garbage_less_often()
     kind, command = _COMMANDS[args[0]]
     parsed = _parse(kind, args)
     with Signals("interrupted"), _json_only(parsed.json) as write:
@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with reporting("print the result"):
           write(json.dumps(_plain(result)) if parsed.json else _show(result))
     return 0
-  except UserError as error:
+  except (UserError, OSError) as error:  # Errors of the file system name the path.
     print_line(f"apnpql: {' '.join(str(error).split())}")
     return 2
   except errors.RunStopped as stop:
@@ -92,13 +92,14 @@ def _json_only(enabled: bool) -> Generator[Callable[[str], Any], None, None]:
   if not enabled:
     yield _print
     return
-  sys.stdout.flush()
+  stream = Unfailing(sys.stdout)
+  stream.flush()
   stdout = os.dup(1)
   os.dup2(2, 1)
   try:
     yield lambda text: os.write(stdout, (text + "\n").encode())
   finally:
-    sys.stdout.flush()
+    stream.flush()
     os.dup2(stdout, 1)
     os.close(stdout)
 

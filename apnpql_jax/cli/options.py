@@ -213,14 +213,19 @@ def parse(kind: type[T], name: str, argv: Sequence[str], default: T | None = Non
 
 
 def _unbox(text: str) -> str:
-  """Returns the message of tyro's error box: its first section and first suggestion."""
-  rows = [line.strip("│ ") for line in text.splitlines() if line.startswith("│")]
+  """Returns the message of tyro's error box: its first section and first suggestion.
+
+  In an ASCII locale, the box has no sides and its title is a section.
+  """
+  rows = [line.strip("│ ") for line in text.splitlines() if line[:1] not in "╭╰"]
   sections: list[list[str]] = [[]]
   for row in rows:
-    if row and not row.strip("─"):
+    if row and not row.strip("─-"):
       sections.append([])
     else:
       sections[-1].append(row)
+  if "╭" not in text:
+    sections = sections[1:] or [[]]
   message = " ".join(sections[0]) or " ".join(text.split()) or "bad options"
   for section in sections[1:]:
     options = [row for row in section if row.startswith("--")]

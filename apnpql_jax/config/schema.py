@@ -289,3 +289,12 @@ class TrainConfig:
 
   sinks: tuple[str, ...] = ()
   """Additional outputs of the metrics: tensorboard, wandb."""
+
+  wandb_project: str = codec.added("apnpql_jax")
+  """Project of the run in Weights & Biases."""
+
+  wandb_entity: str = codec.added("")
+  """User or team that owns the project; empty: your default one."""
+
+  wandb_id: str = codec.added("")
+  """Id of the run in Weights & Biases; empty: drawn, and kept in the run folder."""

@@ -238,10 +238,11 @@ def make_env(config: EnvConfig, mesh: Mesh | None = None, *, instants: int = 0) 
   ``instants`` is ``agent.lstm_instants`` of the agent that acts in it.
 
   Raises:
-    ConfigError: A setting is invalid, the scene cannot be simulated or drawn, or too
-      few resets are usable.
+    ConfigError: A setting is invalid, JAX has no device, the scene cannot be simulated
+      or drawn, or too few resets are usable.
   """
   check_env(config)
+  devices.start()
   task = make_task(config.task)
   # Fail on what the scene does not allow before building the bank.
   _substeps(config, task.scene)

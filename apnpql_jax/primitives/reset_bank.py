@@ -7,15 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import concurrent.futures
+from concurrent.futures.process import BrokenProcessPool
 import dataclasses
 import functools
 import hashlib
 import inspect
 import json
 import multiprocessing
-import os
 import pathlib
-import tempfile
+import sys
 import time
 from typing import Any
 
@@ -26,9 +26,11 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.atomic import replacing
+from apnpql_jax.console import Unfailing, print_line, reporting
+from apnpql_jax.errors import ConfigError, UserError, one_line
 from apnpql_jax.primitives import ik
-from apnpql_jax.runtime import cache_dir, cores
+from apnpql_jax.runtime import cache_dir, cores, end_with_parent
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.sim.native import NativePhysics
@@ -82,23 +84,47 @@ class BankReport:
 
 
 def load_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
-  """Loads the task's bank from the user's cache; builds it first if it is missing."""
-  path = _cache_path(task, rows)
-  if path.exists():
-    with np.load(path, allow_pickle=False) as stored:
-      arrays = dict(stored)
-    report = BankReport(**json.loads(str(arrays.pop("report"))))
-    return ResetBank(**jax.tree.map(jnp.asarray, arrays)), report
+  """Loads the task's bank from the user's cache; builds it if there is no valid one.
+
+  Prints one line if the cached one cannot be used, or the new one cannot be kept.
+  """
+  cache = cache_dir()
+  if cache is None:
+    return build_bank(task, rows)
+  path = cache / "banks" / _file_name(task, rows)
+  try:
+    return _read(path, task, rows)
+  except FileNotFoundError:
+    pass
+  except Exception as error:  # Whatever a damaged or foreign file causes.
+    print_line(f"{path} cannot be used and is built again: {one_line(error)}")
   bank, report = build_bank(task, rows)
   arrays: dict[str, Any] = jax.tree.map(np.asarray, vars(bank))
-  path.parent.mkdir(parents=True, exist_ok=True)
-  # Written atomically, so that no concurrent run reads an incomplete file.
-  with tempfile.NamedTemporaryFile(
-    dir=path.parent, suffix=".npz", delete=False
-  ) as file:
-    np.savez(file, report=json.dumps(vars(report)), **arrays)
-  os.replace(file.name, path)
+  with reporting("keep the reset bank"):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as part:
+      np.savez(part, report=json.dumps(vars(report)), **arrays)
   return bank, report
+
+
+def _read(path: pathlib.Path, task: Task, rows: int) -> tuple[ResetBank, BankReport]:
+  """Reads a bank; raises any exception if the file is not one of this task."""
+  with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+    arrays = dict(stored)
+  report = BankReport(**json.loads(str(arrays.pop("report"))))
+  model = task.scene.model
+  kinds = {
+    "qpos": (np.float32, (rows, model.nq)),
+    "mocap_pos": (np.float32, (rows, model.nmocap, 3)),
+    "mocap_quat": (np.float32, (rows, model.nmocap, 4)),
+    "variant": (np.int32, (rows,)),
+    "targets": (np.float32, (rows, 3, 6)),
+  }
+  if {name: (x.dtype, x.shape) for name, x in arrays.items()} != kinds:
+    raise ValueError("it holds other arrays")
+  if not all(np.isfinite(x).all() for x in arrays.values()):
+    raise ValueError("a number is not finite")
+  return ResetBank(**jax.tree.map(jnp.asarray, arrays)), report
 
 
 def build_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
@@ -106,16 +132,18 @@ def build_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
 
   Raises:
     ConfigError: Too many draws were rejected.
+    UserError: A worker process died.
   """
   began = time.monotonic()
   rng = np.random.default_rng(SEED)
   report = BankReport()
   kept: list[ResetBank] = []
+  unfailing: Any = Unfailing(sys.stderr)
   # Spawn, because forking a process in which XLA threads run can deadlock.
   context = multiprocessing.get_context("spawn")
   with (
-    concurrent.futures.ProcessPoolExecutor(cores(), context) as pool,
-    Progress(console=Console(stderr=True)) as progress,
+    concurrent.futures.ProcessPoolExecutor(cores(), context, end_with_parent) as pool,
+    Progress(console=Console(file=unfailing)) as progress,
   ):
     bar = progress.add_task(f"reset bank of {task.name}", total=rows)
     while (missing := rows - sum(bank.rows for bank in kept)) > 0:
@@ -167,9 +195,15 @@ def _solve_targets(
   arrays = starts, positions, rotations
   chunks = [np.split(x, range(CHUNK, len(x), CHUNK)) for x in arrays]
   solved = []
-  for result in pool.map(ik.solve_all, *chunks):
-    solved.append(result)
-    advance(len(result[0]))
+  try:
+    for result in pool.map(ik.solve_all, *chunks):
+      solved.append(result)
+      advance(len(result[0]))
+  except BrokenProcessPool:
+    raise UserError(
+      "a worker process for the reset bank died; free some memory, and keep the "
+      'guard `if __name__ == "__main__":` in a script'
+    ) from None
   targets, residuals = map(np.concatenate, zip(*solved, strict=True))
   reached = (residuals < [ik.POSITION_TOLERANCE, ik.ROTATION_TOLERANCE]).all((1, 2))
   reached &= np.abs(targets - starts[:, None]).max((1, 2)) < MAX_TRAVEL
@@ -186,12 +220,12 @@ def _solve_targets(
   )
 
 
-def _cache_path(task: Task, rows: int) -> pathlib.Path:
+def _file_name(task: Task, rows: int) -> str:
   key = json.dumps(
     [VERSION, SEED, rows, task.name, task.scene.fingerprint, _source(task)]
   )
   digest = hashlib.sha256(key.encode()).hexdigest()[:16]
-  return cache_dir() / "banks" / f"{task.name}-{rows}-{digest}.npz"
+  return f"{task.name}-{rows}-{digest}.npz"
 
 
 def _source(task: Task) -> str:

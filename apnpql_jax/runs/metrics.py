@@ -10,8 +10,8 @@ import time
 from typing import Any, Protocol
 
 from apnpql_jax.atomic import replacing
+from apnpql_jax.console import print_line, reporting
 from apnpql_jax.errors import FileError, one_line
-from apnpql_jax.runs.console import print_line, reporting
 from apnpql_jax.runs.text import write_text
 
 STEP = "step"  # environment steps, summed over worlds; in every row

@@ -7,7 +7,7 @@ import sys
 import time
 from typing import Any, TextIO
 
-from apnpql_jax.runs.console import Unfailing
+from apnpql_jax.console import Unfailing
 
 _SPEED_PERIOD_S = 600.0
 """Speeds are averaged over this time, which has to span several slow iterations."""

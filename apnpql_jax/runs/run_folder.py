@@ -11,6 +11,7 @@ from pathlib import Path
 import shutil
 from typing import Any, NamedTuple
 
+from apnpql_jax.atomic import check_utf8, check_writable
 from apnpql_jax.config import files
 from apnpql_jax.config.checks import validate
 from apnpql_jax.config.schema import TrainConfig
@@ -28,7 +29,8 @@ _PATTERN = "*?[]\\"
 
 MAY_CHANGE = (
   "total_steps eval_every eval_episodes eval_acting checkpoint_every "
-  "keep_checkpoints save_replay_every max_skipped_updates video sinks"
+  "keep_checkpoints save_replay_every max_skipped_updates video sinks "
+  "wandb_project wandb_entity wandb_id"
 ).split()
 """Settings that a resumed run may change, because they do not affect learning."""
 
@@ -52,7 +54,8 @@ def create(
     FileError: The folder holds a run and ``overwrite`` is not set, it holds anything
       else, or it cannot be created.
   """
-  check_free(run_dir, overwrite=overwrite)
+  _check_characters(run_dir, _PATTERN)
+  _check_replaceable(run_dir, overwrite=overwrite)
   versions = json.dumps(describe_versions(devices), indent=2) + "\n"
   run_dir = run_dir.absolute()
   new, old = _free_name(run_dir, "new"), _free_name(run_dir, "replaced")
@@ -87,9 +90,56 @@ def open_run(run_dir: Path) -> RunFolder:
   return RunFolder(run_dir.absolute(), load_run_config(run_dir))
 
 
-def new_run_dir(preset: str, root: Path = Path("runs")) -> Path:
-  """Returns the first free ``root/<preset>-<n>``, counting from 1."""
-  return _free_name(root / preset)
+@contextlib.contextmanager
+def new_run_dir(preset: str, root: Path = Path("runs")) -> Generator[Path, None, None]:
+  """Makes and yields the first free folder ``root/<preset>-<n>``, counting from 1.
+
+  No other process can choose it. If it is still empty at the end, it is removed.
+
+  Raises:
+    FileError: It cannot be made.
+  """
+  number = 1
+  while not _make(path := root / f"{preset}-{number}"):
+    number += 1
+  with _removed_if_empty(path):
+    yield path
+
+
+@contextlib.contextmanager
+def reserve(run_dir: Path) -> Generator[None, None, None]:
+  """Locks the folder of a run that is about to start or resume; makes a missing one.
+
+  If it was missing and is still empty at the end, it is removed.
+
+  Raises:
+    FileError: It cannot be made, or another process has reserved it or trains the run.
+  """
+  made = _make(run_dir)
+  with _removed_if_empty(run_dir) if made else contextlib.nullcontext():
+    with lock(run_dir):
+      yield
+
+
+def _make(run_dir: Path) -> bool:
+  """Makes a folder; returns False if its name is taken."""
+  try:
+    run_dir.parent.mkdir(parents=True, exist_ok=True)
+    with contextlib.suppress(FileExistsError):
+      run_dir.mkdir()
+      return True
+  except OSError as error:
+    raise FileError(f"cannot make run folder {str(run_dir)!r}: {error}") from None
+  return False
+
+
+@contextlib.contextmanager
+def _removed_if_empty(folder: Path) -> Generator[None, None, None]:
+  try:
+    yield
+  finally:
+    with contextlib.suppress(OSError):
+      folder.rmdir()
 
 
 def load_run_config(
@@ -159,6 +209,7 @@ def check_resumable(run_dir: Path, wanted: TrainConfig) -> None:
       path.
   """
   _check_characters(run_dir, _PATTERN)
+  check_writable(run_dir)
   if diff := fixed_diff(load_run_config(run_dir), wanted):
     raise ConfigError(
       f"{str(run_dir)!r} was made with other settings: {diff}; resume it without them "
@@ -199,11 +250,19 @@ def check_free(run_dir: Path, *, overwrite: bool) -> None:
   """Checks that a run folder can be created: it is new, empty, or to be overwritten.
 
   Raises:
-    FileError: The folder holds a run and ``overwrite`` is not set, its run is being
-      trained, it holds anything else, which is never removed, or checkpoints cannot be
-      saved under its path.
+    FileError: The folder holds a run and ``overwrite`` is not set, another process has
+      reserved it or trains its run, it holds anything else, which is never removed, or
+      it cannot be written.
   """
   _check_characters(run_dir, _PATTERN)
+  check_writable(run_dir.parent)
+  _check_replaceable(run_dir, overwrite=overwrite)
+  if run_dir.exists():
+    _check_idle(run_dir)
+
+
+def _check_replaceable(run_dir: Path, *, overwrite: bool) -> None:
+  """Raises ``FileError`` if there is anything that ``create`` must not replace."""
   if not run_dir.exists():
     return
   if not run_dir.is_dir() or run_dir.is_symlink():
@@ -219,11 +278,11 @@ def check_free(run_dir: Path, *, overwrite: bool) -> None:
       f"{str(run_dir)!r} holds a run; resume it with --resume {run_dir}, replace it "
       "with --overwrite, or choose another --run"
     )
-  _check_idle(run_dir)
 
 
 def _check_characters(run_dir: Path, refused: str) -> None:
-  """Raises ``FileError`` if the absolute path has any of the refused characters."""
+  """Raises ``FileError`` if the absolute path is not UTF-8 or has such characters."""
+  check_utf8(run_dir)
   path = str(run_dir.absolute())
   if found := sorted(set(path) & set(refused)):
     raise FileError(
@@ -232,9 +291,9 @@ def _check_characters(run_dir: Path, refused: str) -> None:
     )
 
 
-def _free_name(path: Path, kind: str = "") -> Path:
-  stem, number = f"{path.name}{kind and '.' + kind}", 1
-  while (free := path.with_name(f"{stem}-{number}")).exists():
+def _free_name(path: Path, kind: str) -> Path:
+  number = 1
+  while (free := path.with_name(f"{path.name}.{kind}-{number}")).exists():
     number += 1
   return free
 

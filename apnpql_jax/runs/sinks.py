@@ -6,19 +6,26 @@ from collections.abc import Mapping, Sequence
 import importlib.util
 from pathlib import Path
 from typing import Any
+import uuid
 
+from apnpql_jax.console import reporting
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs.metrics import Sink
+from apnpql_jax.runs.text import read_text, write_text
 
 
 class _TensorboardSink:
   """Sink to event files in ``tensorboard/`` of the run folder."""
 
-  def __init__(self, run_dir: Path, config: Mapping[str, Any]):
+  def __init__(self, run_dir: Path, config: Mapping[str, Any], resume_step: int | None):
     del config
     from tensorboardX import SummaryWriter
 
-    self._writer = SummaryWriter(logdir=str(run_dir / "tensorboard"))
+    # TensorBoard discards what a killed process wrote from ``purge_step`` on.
+    purge_step = None if resume_step is None else resume_step + 1
+    self._writer = SummaryWriter(
+      logdir=str(run_dir / "tensorboard"), purge_step=purge_step, flush_secs=1
+    )
 
   def write(self, step: int, row: Mapping[str, float]) -> None:
     """See ``Sink.write``."""
@@ -31,18 +38,34 @@ class _TensorboardSink:
 
 
 class _WandbSink:
-  """Sink to a Weights & Biases run named after the run folder."""
+  """Sink to a Weights & Biases run named after the run folder, also after a resume.
 
-  def __init__(self, run_dir: Path, config: Mapping[str, Any]):
+  Unless ``wandb_id`` sets the id, one is drawn and kept in the run folder.
+  """
+
+  def __init__(self, run_dir: Path, config: Mapping[str, Any], resume_step: int | None):
+    del resume_step
     import wandb
 
+    path = run_dir / "wandb_id"
+    drawn = read_text(path, 100) if path.exists() else uuid.uuid4().hex[:8]
+    write_text(path, identity := config["wandb_id"] or drawn)
     self._run = wandb.init(
-      project="apnpql_jax", name=run_dir.name, dir=str(run_dir), config=dict(config)
+      project=config["wandb_project"],
+      entity=config["wandb_entity"] or None,
+      id=identity,
+      resume="allow",
+      name=run_dir.name,
+      dir=str(run_dir),
+      config=dict(config),
+      allow_val_change=True,  # Such as ``total_steps``.
     )
+    self._next_step = self._run.step
 
   def write(self, step: int, row: Mapping[str, float]) -> None:
-    """See ``Sink.write``."""
-    self._run.log(dict(row), step=step)
+    """See ``Sink.write``; leaves out steps that the run already has."""
+    if step >= self._next_step:
+      self._run.log(dict(row), step=step)
 
   def close(self) -> None:
     """See ``Sink.close``."""
@@ -73,7 +96,22 @@ def check_sinks(names: Sequence[str]) -> None:
 
 
 def make_sinks(
-  names: Sequence[str], run_dir: Path, config: Mapping[str, Any]
+  names: Sequence[str],
+  run_dir: Path,
+  config: Mapping[str, Any],
+  *,
+  resume_step: int | None = None,
 ) -> list[Sink]:
-  """Opens the named sinks; ``config`` is plain data shown with the curves."""
-  return [_SINKS[name][0](run_dir, config) for name in names]
+  """Opens the named sinks; prints a line for each that cannot be opened.
+
+  Args:
+    names: Names of sinks.
+    run_dir: The run folder.
+    config: Settings of the run as plain data, shown with the curves.
+    resume_step: Step from which the run resumes; None for a new run.
+  """
+  sinks: list[Sink] = []
+  for name in names:
+    with reporting(f"open the metric sink {name}"):
+      sinks.append(_SINKS[name][0](run_dir, config, resume_step))
+  return sinks

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 from pathlib import Path
 import time
 from typing import Any, NamedTuple
@@ -16,12 +15,13 @@ import numpy as np
 
 from apnpql_jax import devices
 from apnpql_jax.agents.learner import Agent, LearnerState, make_agent
+from apnpql_jax.atomic import check_utf8, check_writable
 from apnpql_jax.config.checks import ACTING, check_env
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
+from apnpql_jax.console import print_line, reporting
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs import checkpoint_reader, leaves, run_folder
-from apnpql_jax.runs.console import print_line, reporting
 from apnpql_jax.runs.metrics import wilson_interval
 from apnpql_jax.training.rollout import (
   Episodes,
@@ -197,13 +197,10 @@ def _check(episodes: int, seed: int, video: Path | str | None) -> Path | None:
   path = Path(video)
   if path.suffix not in (".mp4", ".gif"):
     raise ConfigError(f"video {path} must end in .mp4 or .gif")
-  try:
-    folder = next(p for p in path.absolute().parents if p.exists())
-    fit = folder.is_dir() and os.access(folder, os.W_OK) and not path.is_dir()
-  except OSError as error:
-    raise ConfigError(f"video {path}: {error}") from None
-  if not fit:
-    raise ConfigError(f"video {path} cannot be written")
+  check_utf8(path)
+  check_writable(path.absolute().parent)
+  if path.is_dir():
+    raise ConfigError(f"video {path} is a folder")
   return path
 
 

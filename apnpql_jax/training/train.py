@@ -20,12 +20,12 @@ from apnpql_jax.agents import table_one
 from apnpql_jax.agents.learner import Agent, make_agent
 from apnpql_jax.config import codec
 from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.console import print_line
 from apnpql_jax.data import demonstrations, replay
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.errors import ConfigError, RunStopped
 from apnpql_jax.runs import checkpoint_reader, leaves, provenance, run_folder
 from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
-from apnpql_jax.runs.console import print_line
 from apnpql_jax.runs.metrics import MetricWriter
 from apnpql_jax.runs.progress import TrainProgress
 from apnpql_jax.runs.signals import Signals
@@ -86,7 +86,9 @@ def train(
     f"stopped before the first iteration; {hint if resume else 'nothing is saved'}"
   )
   with signals if handle_signals else contextlib.nullcontext():
-    start = _start(config, run_dir, mesh, resume=resume, overwrite=overwrite)
+    reserved = run_folder.reserve(run_dir) if devices.is_primary() else None
+    with reserved or contextlib.nullcontext():
+      start = _start(config, run_dir, mesh, resume=resume, overwrite=overwrite)
     _print_line(f"run folder {start.path}; compiling, which can take minutes")
     try:
       state, evaluation = _run(config, start, signals)
@@ -115,6 +117,7 @@ def _check(
   handle_signals: bool,
 ) -> None:
   """Raises ``UserError`` if the run cannot start; see ``train`` for the arguments."""
+  devices.start()
   run_folder.check_start(
     run_dir,
     config,
@@ -144,7 +147,8 @@ def _run(
         print_line(f"later checkpoints and a copy of the metrics were moved to {aside}")
     devices.barrier()
     if devices.is_primary():
-      sinks = make_sinks(config.sinks, path, dict(codec.flatten(config)))
+      settings = dict(codec.flatten(config))
+      sinks = make_sinks(config.sinks, path, settings, resume_step=resume_step)
       writer = MetricWriter(path, resume_step=resume_step, sinks=sinks)
       stack.enter_context(writer)
       progress = stack.enter_context(TrainProgress(config.total_steps))
@@ -170,8 +174,10 @@ def _start(
   overwrite: bool,
 ) -> Start:
   """Builds or restores everything; creates the run folder last."""
-  # Orbax logs a traceback per thread when a save fails; the run reports it in one line.
-  logging.getLogger("absl").setLevel(logging.CRITICAL)
+  # Orbax and its abandoned tasks log pages of tracebacks when a save fails; the run
+  # reports it in one line.
+  for name in ("absl", "asyncio"):
+    logging.getLogger(name).setLevel(logging.CRITICAL)
   count = mesh.size if mesh else 1
   if resume:
     path = run_folder.open_run(run_dir).path
@@ -181,8 +187,8 @@ def _start(
   if saved:
     checkpoint_reader.restore(run_dir, None, {}, config=config)  # Fails early.
   fill = None if saved else _expert(config)
+  agent = make_agent(config.agent)  # Before the worlds, which can take minutes.
   env = make_env(config.env, mesh, instants=config.agent.lstm_instants)
-  agent = make_agent(config.agent)
   example = example_state(config, env, agent)
   devices.check_memory(leaves.nbytes(example), "the training state")
   # Compile while the state is being made or read, which also compiles: XLA keeps a

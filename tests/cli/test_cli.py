@@ -78,6 +78,9 @@ BAD_INPUT = [
   ("train push_plate --run .", ["not a run", "--run"]),
   ("train push_plate --run . --overwrite", ["not a run", "--run"]),
   ("train push_plate --run runs/old/config.json", ["not a folder"]),
+  ("train push_plate --run runs/old/config.json/x", ["cannot write", "config.json"]),
+  (f"train push_plate --run {256 * 'x'}", ["File name too long"]),
+  ("train push_plate --run /proc/run", ["cannot write to '/proc'"]),
   ("train push_plate --run runs/old --overwrite --env.task juggle", ["push_plate"]),
   ("train push_plate --resume runs/old --seed 9", ["seed 0 -> 9"]),
   ("train --resume runs/old --agent.gamma 0.9", ["agent.gamma 0.99 -> 0.9"]),
@@ -88,6 +91,8 @@ BAD_INPUT = [
   ("evaluate runs/old --episodes 0", ["episodes=0"]),
   ("evaluate runs/old --seed -1", ["seed=-1"]),
   ("evaluate runs/old --checkpoint last", ["'last'", "newest", "best"]),
+  ("evaluate runs/old --checkpoint ²", ["'²'", "newest", "best"]),
+  (f"evaluate runs/old --checkpoint {5000 * '9'}", ["newest", "best"]),
   ("evaluate runs/old", ["no checkpoint"]),
   ("convert", ["REC.npz", "TASK", "OUT.npz"]),
   ("convert none.npz juggle out.npz", ["'juggle'", "push_plate"]),
@@ -107,7 +112,11 @@ BAD_INPUT = [
   ("collect push_plate --video runs", ["video", ".mp4", ".gif"]),
   ("collect push_plate --save runs", ["runs is a folder"]),
   ("collect push_plate --save none/x.npz", ["none/x.npz is a folder, or in none"]),
-  ("collect push_plate --video runs/old/config.json/x.mp4", ["video", "written"]),
+  ("collect push_plate --save /proc/x.npz", ["cannot write to '/proc'"]),
+  ("collect push_plate --video runs/old/config.json/x.mp4", ["cannot write", "Not a"]),
+  ("collect push_plate --video /proc/x/y.mp4", ["cannot write to '/proc/x'"]),
+  (f"collect push_plate --video {256 * 'x'}.mp4", ["File name too long"]),
+  ("collect push_plate --video \udcff.mp4", ["udcff.mp4' is not UTF-8"]),
   ("evaluate runs/old --video x.avi", ["video", ".mp4", ".gif"]),
   ("list tasks", ["tasks"]),
 ]
@@ -137,6 +146,37 @@ def test_a_process_with_bad_input_prints_the_same_line(
   done = apnpql(*line.split(), cwd=tmp_path)
   monkeypatch.chdir(tmp_path)
   assert (done.returncode, done.stderr) == (main(line.split()), capfd.readouterr().err)
+
+
+ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+
+
+@pytest.mark.parametrize(
+  ("line", "settings", "words"),
+  [
+    (
+      "train push_plate --agent.epsilo 1",
+      ASCII,
+      "Unrecognized options: --agent.epsilo, 1; perhaps you meant --agent.epsilon FLOAT"
+      " (see apnpql train --help)",
+    ),
+    ("train push_plate --run été", ASCII, "is not UTF-8, or the locale is not"),
+    ("evaluate été", ASCII, "'\\udcc3\\udca9t\\udcc3\\udca9' is not a run folder"),
+    ("list", {"JAX_ENABLE_X64": "1"}, "JAX_ENABLE_X64=1 is not supported"),
+    ("train push_plate", {"JAX_PLATFORMS": "moon"}, "no device for JAX_PLATFORMS=moon"),
+    ("convert a push_plate b", {"JAX_PLATFORMS": "moon"}, "JAX_PLATFORMS=moon"),
+    ("collect push_plate", {"JAX_PLATFORMS": "cuda"}, "JAX_PLATFORMS=cuda"),
+  ],
+)
+def test_an_environment_that_cannot_work_ends_with_one_line(
+  line, settings, words, tmp_path, monkeypatch
+):
+  for name, value in settings.items():
+    monkeypatch.setenv(name, value)
+  done = apnpql(*line.split(), cwd=tmp_path)
+  (error,) = done.stderr.splitlines()
+  assert done.returncode == 2 and words in error
+  assert not any(path.is_file() for path in tmp_path.rglob("*"))
 
 
 def test_existing_files_are_replaced_only_if_asked(run_dir, tmp_path, capsys):
@@ -189,11 +229,12 @@ def test_list_prints_one_json_object_and_nothing_else(tmp_path):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="only on Linux")
+@pytest.mark.parametrize("command", ["--version", "list --json"])
 @pytest.mark.parametrize(
   "streams", [">/dev/full", "2>/dev/full", ">&-", ">&- 2>&- <&-"]
 )
-def test_output_that_cannot_be_written_changes_no_exit_code(streams, tmp_path):
-  command = f"{sys.executable} -m apnpql_jax --version {streams}"
+def test_output_that_cannot_be_written_changes_no_exit_code(command, streams, tmp_path):
+  command = f"{sys.executable} -m apnpql_jax {command} {streams}"
   done = subprocess.run(
     ["sh", "-c", command],
     cwd=tmp_path,

@@ -40,6 +40,9 @@ ADDED = {
   "agent.image_shift": 0,
   "agent.color_jitter": 0.0,
   "eval_acting": "policy",
+  "wandb_project": "apnpql_jax",
+  "wandb_entity": "",
+  "wandb_id": "",
   "replay.demonstrations": "",
 }
 """Behavior of runs from before these settings existed. No value here may ever

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import io
+import os
+import signal
+import subprocess
+import sys
+import time
+from typing import Any
+
 from hand_made import SLOW_MJX
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from apnpql_jax import testing
 from apnpql_jax.primitives import ik, reset_bank, tracking
 from apnpql_jax.sim import arm, physics
 from apnpql_jax.sim.kinematics import make_kinematics
@@ -25,6 +34,40 @@ def small_bank(task, tmp_path_factory):
   jax.tree.map(np.testing.assert_array_equal, built[0], again[0])
   assert built[1] == again[1]
   return built
+
+
+def test_a_damaged_or_foreign_bank_is_built_again(task, tmp_path, monkeypatch, capfd):
+  monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+  os.umask(umask := os.umask(0))
+  expected, _ = reset_bank.load_bank(task, 16)
+  (path,) = (tmp_path / "apnpql_jax" / "banks").iterdir()
+  assert path.stat().st_mode & 0o777 == 0o666 & ~umask  # Others may read it.
+  whole = path.read_bytes()
+  others, broken = io.BytesIO(), io.BytesIO()
+  np.savez(others, report="{}", qpos=np.zeros(16))
+  nans = np.full((16, 3, 6), np.nan, np.float32)
+  arrays: dict[str, Any] = dict(np.load(io.BytesIO(whole))) | {"targets": nans}
+  np.savez(broken, **arrays)
+  flipped = bytearray(whole)
+  flipped[len(whole) // 2] ^= 1
+  damages = b"", b"text", whole[:-100], bytes(flipped), others.getvalue()
+  for damage in (*damages, broken.getvalue()):
+    path.write_bytes(damage)
+    capfd.readouterr()
+    bank, _ = reset_bank.load_bank(task, 16)
+    jax.tree.map(np.testing.assert_array_equal, bank, expected)
+    assert capfd.readouterr().err.count("cannot be used and is built again: ") == 1
+  reset_bank.load_bank(task, 16)
+  assert capfd.readouterr().err == ""
+
+
+def test_a_bank_that_cannot_be_kept_costs_one_line(task, tmp_path, monkeypatch, capfd):
+  (tmp_path / "apnpql_jax").mkdir()
+  (tmp_path / "apnpql_jax" / "banks").write_text("a file")
+  monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+  bank, _ = reset_bank.load_bank(task, 16)
+  assert bank.rows == 16
+  assert capfd.readouterr().err.count("cannot keep the reset bank: ") == 1
 
 
 def test_bank_targets_reach_their_poses(task, small_bank):
@@ -66,6 +109,47 @@ def test_bank_rejects_overlapping_and_unreachable_draws(capsys):
   assert (spots[..., 0] < 0.6).all()
   printed = " ".join(capsys.readouterr().err.split())
   assert "64 drawn; rejected: 22 not at rest, 22 out of reach" in printed
+
+
+BUILD = """
+import multiprocessing, threading, time
+from apnpql_jax.primitives.reset_bank import build_bank
+from apnpql_jax.tasks import make_task
+
+def report():
+  while not multiprocessing.active_children():
+    time.sleep(0.01)
+  print(multiprocessing.active_children()[0].pid, flush=True)
+
+threading.Thread(target=report, daemon=True).start()
+build_bank(make_task("push_plate"), 128)
+"""
+
+
+def _build() -> tuple[subprocess.Popen[str], int]:
+  """Returns a new process that builds a bank, and the pid of one of its workers."""
+  command, pipe = [sys.executable, "-c", BUILD], subprocess.PIPE
+  process = subprocess.Popen(
+    command, stdout=pipe, stderr=pipe, text=True, cwd=testing.ROOT
+  )
+  assert process.stdout is not None
+  return process, int(process.stdout.readline())
+
+
+@pytest.mark.parametrize("delay", [0.0, 1.5], ids=["starting", "working"])
+def test_workers_end_with_a_killed_process(delay):
+  process, _ = _build()
+  time.sleep(delay)
+  process.kill()
+  process.communicate(timeout=20)  # Ends with the last process that holds the pipe.
+
+
+def test_a_killed_worker_ends_the_build_with_one_line():
+  process, worker = _build()
+  os.kill(worker, signal.SIGKILL)
+  _, shown = process.communicate(timeout=60)
+  assert process.returncode == 1
+  assert "UserError: a worker process for the reset bank died" in shown
 
 
 def test_refinement_agrees_with_mink(task, small_bank):

@@ -11,6 +11,7 @@ from pathlib import Path
 import pty
 import struct
 import sys
+import time
 
 from hypothesis import given, settings, strategies as st
 import imageio.v3 as iio
@@ -20,9 +21,11 @@ import pytest
 from scipy import stats
 from tensorboardX.proto import event_pb2
 
+from apnpql_jax.config import codec
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.console import print_line
 from apnpql_jax.errors import UserError
 from apnpql_jax.runs import metrics
-from apnpql_jax.runs.console import print_line
 from apnpql_jax.runs.progress import TrainProgress
 from apnpql_jax.runs.sinks import check_sinks, make_sinks
 
@@ -196,19 +199,57 @@ def test_a_broken_sink_costs_no_rows(tmp_path: Path, capsys):
   assert capsys.readouterr().err.count("no network") == 1
 
 
-def test_tensorboard_holds_every_number(tmp_path: Path):
+def _shown(folder: Path) -> list[tuple[int, str, float]]:
+  """Returns what TensorBoard shows of event files: (step, name, value).
+
+  A start event discards what came before it from its step on.
+  """
+  shown: list[tuple[int, str, float]] = []
+  for path in sorted(folder.iterdir()):
+    data, at = path.read_bytes(), 0
+    while at < len(data):  # Records of TFRecord: length, its check, event, its check.
+      (length,) = struct.unpack_from("<Q", data, at)
+      event = event_pb2.Event.FromString(data[at + 12 : at + 12 + length])
+      if event.session_log.status == event_pb2.SessionLog.START:
+        shown = [item for item in shown if item[0] < event.step]
+      shown += [(event.step, v.tag, v.simple_value) for v in event.summary.value]
+      at += 16 + length
+  return shown
+
+
+def test_tensorboard_shows_every_number_once_also_after_a_resume(tmp_path: Path):
   check_sinks(["tensorboard"])
   (sink,) = make_sinks(["tensorboard"], tmp_path, {"seed": 0})
-  sink.write(3, {"a/b": 0.5, "c": -2.0})
+  for step in (1, 2, 3):
+    sink.write(step, {"a/b": 0.5, "c": -2.0})
   sink.close()
-  (path,) = (tmp_path / "tensorboard").iterdir()
-  data, found, at = path.read_bytes(), [], 0
-  while at < len(data):  # Records of TFRecord: length, its check, event, its check.
-    (length,) = struct.unpack_from("<Q", data, at)
-    event = event_pb2.Event.FromString(data[at + 12 : at + 12 + length])
-    found += [(event.step, v.tag, v.simple_value) for v in event.summary.value]
-    at += 16 + length
-  assert found == [(3, "a/b", 0.5), (3, "c", -2.0)]
+  time.sleep(1.1)  # Names of event files hold the second.
+  (sink,) = make_sinks(["tensorboard"], tmp_path, {"seed": 0}, resume_step=1)
+  for step in (2, 3):
+    sink.write(step, {"a/b": 0.25})
+  sink.close()
+  expected = [(1, "a/b", 0.5), (1, "c", -2.0), (2, "a/b", 0.25), (3, "a/b", 0.25)]
+  assert _shown(tmp_path / "tensorboard") == expected
+
+
+def test_a_resume_continues_the_run_of_wandb(tmp_path: Path, monkeypatch):
+  pytest.importorskip("wandb")
+  monkeypatch.setenv("WANDB_MODE", "offline")
+  config = dict(codec.flatten(TrainConfig()))
+  for changed in ({}, {"total_steps": 1}, {"wandb_id": "mine"}):
+    (sink,) = make_sinks(["wandb"], tmp_path, config | changed, resume_step=1)
+    sink.write(3, {"a/b": 0.5})
+    sink.close()
+  folders = (tmp_path / "wandb").glob("offline-run-*")
+  ids = {path.name.rpartition("-")[2] for path in folders}
+  assert len(ids) == 2 and "mine" in ids
+
+
+def test_a_sink_that_cannot_be_opened_costs_no_run(tmp_path: Path, capsys):
+  (tmp_path / "tensorboard").write_text("a file")
+  assert make_sinks(["tensorboard"], tmp_path, {}) == []
+  (line,) = capsys.readouterr().err.splitlines()
+  assert line.startswith("cannot open the metric sink tensorboard: ")
 
 
 def test_extras_that_are_unknown_or_missing_are_named(monkeypatch: pytest.MonkeyPatch):

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from pathlib import Path
 import resource
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -26,11 +28,47 @@ def write_run(folder: Path, config: TrainConfig | None = None) -> Path:
   return folder
 
 
-def test_new_run_dir_takes_the_first_free_number(tmp_path):
-  assert run_folder.new_run_dir("push_plate", tmp_path) == tmp_path / "push_plate-1"
-  (tmp_path / "push_plate-1").mkdir()
-  (tmp_path / "push_plate-3").mkdir()
-  assert run_folder.new_run_dir("push_plate", tmp_path) == tmp_path / "push_plate-2"
+def test_new_run_dir_makes_the_first_free_number(tmp_path):
+  root = tmp_path / "runs"
+  (root / "push_plate-1").mkdir(parents=True)
+  (root / "push_plate-3").mkdir()
+  with run_folder.new_run_dir("push_plate", root) as second:
+    with run_folder.new_run_dir("push_plate", root) as fourth:
+      assert [second.name, fourth.name] == ["push_plate-2", "push_plate-4"]
+      run_folder.create(fourth, TrainConfig())
+  left = {path.name for path in root.iterdir()}
+  assert left == {"push_plate-1", "push_plate-3", "push_plate-4"}
+
+
+def test_two_runs_started_together_take_two_folders(tmp_path):
+  """Before anything is built: both are killed as soon as they have chosen."""
+  command = [sys.executable, "-m", "apnpql_jax", "train", "push_plate"]
+  env = os.environ | {"PYTHONPATH": str(ROOT)}
+  processes = [subprocess.Popen(command, cwd=tmp_path, env=env) for _ in range(2)]
+  folders = [tmp_path / "runs" / f"push_plate-{n}" for n in (1, 2)]
+  deadline = time.monotonic() + 60
+  while not all(folder.exists() for folder in folders):
+    assert time.monotonic() < deadline
+    time.sleep(0.01)
+  for process in processes:
+    process.kill()
+    process.wait()
+  assert not any(path.is_file() for path in tmp_path.rglob("*"))
+
+
+def test_a_reserved_folder_is_refused_and_removed_if_unused(tmp_path):
+  run = tmp_path / "run"
+  with run_folder.reserve(run):
+    with pytest.raises(UserError, match="another process"):
+      run_folder.check_free(run, overwrite=False)
+    with pytest.raises(UserError, match="another process"):
+      run_folder.reserve(run).__enter__()
+  assert not run.exists()
+  with run_folder.reserve(run):
+    run_folder.create(run, TrainConfig())
+  with run_folder.reserve(run), pytest.raises(UserError, match="another process"):
+    run_folder.check_resumable(run, TrainConfig())
+  assert run_folder.load_run_config(run) == TrainConfig()
 
 
 def test_configuration_of_a_run_is_read_back(tmp_path):
@@ -73,7 +111,8 @@ def test_resume_may_change_only_what_does_not_alter_learning(tmp_path):
   for name in run_folder.MAY_CHANGE:
     value = getattr(TrainConfig(), name)
     others = {bool: lambda x: not x, int: lambda x: x + 1, tuple: lambda x: (*x, "a")}
-    other = "mean" if name == "eval_acting" else others[type(value)](value)
+    others[str] = lambda x: "mean"
+    other = others[type(value)](value)
     run_folder.check_resumable(run, dataclasses.replace(TrainConfig(), **{name: other}))
   fixed = {f.name for f in dataclasses.fields(TrainConfig)} - set(run_folder.MAY_CHANGE)
   for name in fixed - {"env", "agent", "replay"}:

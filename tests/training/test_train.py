@@ -66,10 +66,16 @@ def changed(**settings: object) -> TrainConfig:
       FileError,
       "none is not an .npz archive",
     ),
+    (
+      changed(env=dataclasses.replace(testing.TINY.env, control_period_s=0.151)),
+      {},
+      ConfigError,
+      "control_period_s=0.151 must be a multiple of the scene's timestep",
+    ),
     (testing.TINY, {"run_dir": "old"}, FileError, "old' holds a run"),
     (changed(seed=1), {"run_dir": "old", "resume": True}, ConfigError, "seed 0 -> 1"),
   ],
-  ids=["settings", "sinks", "demonstrations", "folder", "resume"],
+  ids=["settings", "sinks", "demonstrations", "timestep", "folder", "resume"],
 )
 def test_a_run_that_cannot_start_builds_and_writes_nothing(
   config, options, error, words, tmp_path, monkeypatch
@@ -81,6 +87,20 @@ def test_a_run_that_cannot_start_builds_and_writes_nothing(
   with pytest.raises(error, match=words):
     train(config, **{"run_dir": "new"} | options)
   assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_a_second_start_in_one_folder_builds_nothing(tmp_path, monkeypatch, resume):
+  """The first one has reserved the folder after the second one checked it."""
+  monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # Of the banks.
+  run = tmp_path / "run"
+  if resume:
+    run_folder.create(run, testing.TINY)
+  monkeypatch.setattr(run_folder, "check_start", lambda *_, **__: None)
+  with run_folder.reserve(run):
+    with pytest.raises(FileError, match="is being trained by another process"):
+      train(testing.TINY, run, resume=resume)
+  assert run.exists() == resume and not (tmp_path / "cache").exists()
 
 
 def test_only_the_main_thread_can_be_asked_to_handle_signals(tmp_path):
