@@ -109,8 +109,8 @@ def test_learning_rates_decay_along_a_cosine_to_a_tenth():
   opt_state, taken = optimizer.init(trained), []
   for _ in range(6):
     # With a constant gradient, Adam moves by the learning rate.
-    steps: Any
-    steps, opt_state = optimizer.update(trained, opt_state, trained)
+    updates, opt_state = optimizer.update(trained, opt_state, trained)
+    steps: Any = updates
     taken.append([-float(steps[k][0]) for k in ("encoder", "bp", "alpha")])
   cosine = 0.5 + 0.5 * np.cos(np.pi * np.minimum(np.arange(6), 4) / 4)
   share = 0.1 + 0.9 * cosine
