@@ -13,8 +13,11 @@ _PUSH = load_preset("push_plate")
 
 CONFIG = dataclasses.replace(
   _PUSH,
-  env=dataclasses.replace(_PUSH.env, task="stack_box"),
+  # Grasps need many scenes: worlds at once, and reset states to draw from.
+  env=dataclasses.replace(_PUSH.env, task="stack_box", worlds=64, bank_rows=8_192),
   agent=dataclasses.replace(_PUSH.agent, min_prob=0.02),
-  replay=dataclasses.replace(_PUSH.replay, capacity=51_200, expert_steps=25_600),
-  total_steps=40_960,
+  replay=dataclasses.replace(_PUSH.replay, capacity=51_200, expert_steps=51_200),
+  total_steps=122_880,
+  eval_every=20_480,
+  checkpoint_every=20_480,
 )

@@ -85,6 +85,9 @@ PAPER = ("ap_npql", "ap_mpo", "ap_sac", "sac")
 
 TASKS = ("push_plate", "stack_box", "flip_cup", "place_plate")
 
+EXPERT_STEPS = {"push_plate": 6_400}
+"""Slots of the expert's replay; 25,600 for other tasks."""
+
 STEPS = 30_720
 """Environment steps per run; four per update."""
 
@@ -108,12 +111,14 @@ def path_of(task: str, row: str, seed: int) -> Path:
   return OUT / f"{task}-{row}-{seed}.json"
 
 
-def options_of(row: str, seed: int) -> list[str]:
+def options_of(task: str, row: str, seed: int) -> list[str]:
   """Returns the command-line options that change the preset of a task."""
   algorithm, flags, budget = ROWS[row]
   options = (
     f"--env.obs state --agent.algorithm {algorithm} --seed {seed} --no-video "
+    "--env.worlds 32 --env.bank-rows 2048 "
     "--eval-acting policy --agent.candidate-precision float32 "
+    f"--replay.expert-steps {EXPERT_STEPS.get(task, 25_600)} "
     f"--total-steps {budget * STEPS} --eval-every {budget * STEPS // EVALUATIONS} "
     f"--agent.target-samples {CANDIDATES} --agent.policy-samples {CANDIDATES} {flags}"
   )
@@ -123,12 +128,15 @@ def options_of(row: str, seed: int) -> list[str]:
 def config_of(task: str, row: str, seed: int) -> TrainConfig:
   """Returns the settings of a run."""
   base = Train(config=load_preset(task))
-  return parse(Train, "train", options_of(row, seed), default=base).config
+  return parse(Train, "train", options_of(task, row, seed), default=base).config
 
 
 def train(task: str, row: str, seed: int) -> None:
   """Trains and evaluates a run, and writes its result when all is complete."""
-  command, path = ["train", task, *options_of(row, seed)], path_of(task, row, seed)
+  command, path = (
+    ["train", task, *options_of(task, row, seed)],
+    path_of(task, row, seed),
+  )
   with tempfile.TemporaryDirectory() as folder:
     run = Path(folder) / "run"
     apnpql = [sys.executable, "-m", "apnpql_jax"]
