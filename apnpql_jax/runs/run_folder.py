@@ -84,9 +84,11 @@ def open_run(run_dir: Path) -> RunFolder:
   """
   _check_characters(run_dir, "\\")  # TensorStore reads a backslash as a slash.
   inside = run_dir.resolve()
-  for path in sorted(run_dir.rglob("*")):
-    if path.is_symlink() and not path.resolve().is_relative_to(inside):
-      raise FileError(f"{path} is a link that leads out of the run folder")
+  # A run that is training makes and removes folders; ``walk`` passes over those.
+  for folder, folders, names in os.walk(run_dir):
+    for path in (Path(folder, name) for name in folders + names):
+      if path.is_symlink() and not path.resolve().is_relative_to(inside):
+        raise FileError(f"{path} is a link that leads out of the run folder")
   return RunFolder(run_dir.absolute(), load_run_config(run_dir))
 
 
