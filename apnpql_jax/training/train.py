@@ -192,7 +192,12 @@ def _start(
   agent = make_agent(config.agent)  # Before the worlds, which can take minutes.
   env = make_env(config.env, mesh, instants=config.agent.lstm_instants)
   example = example_state(config, env, agent)
-  devices.check_memory(leaves.nbytes(example), "the training state")
+  size = leaves.nbytes(example)
+  devices.check_memory(size, "the training state")
+  # The newest ones, the best one, and the one being written. A resumed run has most.
+  kept = 1 if saved else config.keep_checkpoints + 2
+  if warning := run_folder.check_disk(run_dir, count * size, kept=kept):
+    _print_line(warning)
   if fill is None:
     state = restore(config, run_dir, example, _print_line)
     return Start(env, agent, path, state, int(state.env_steps))
