@@ -50,6 +50,11 @@ def check_utf8(path: Path) -> None:
     )
 
 
+def existing(path: Path) -> Path:
+  """Returns the path itself or, if it does not exist, its nearest folder that does."""
+  return next(found for found in (path, *path.absolute().parents) if found.exists())
+
+
 def check_writable(folder: Path) -> None:
   """Checks that files can be made in a folder or, if it is missing, that it can be.
 
@@ -57,8 +62,7 @@ def check_writable(folder: Path) -> None:
     FileError: They cannot; nothing is left behind.
   """
   try:
-    found = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    with tempfile.TemporaryFile(dir=found):
+    with tempfile.TemporaryFile(dir=existing(folder)):
       pass
   except OSError as error:
     raise FileError(f"cannot write to {str(folder)!r}: {error.strerror}") from None

@@ -70,8 +70,10 @@ def restore(
     FileError: There is no such checkpoint, it belongs to another configuration or
       format, its leaves differ from the example, or its files cannot be read.
   """
-  damaged: list[str] = []
-  for candidate in _candidates(run_dir, step):
+  damaged: dict[int, str] = {}
+  # Listed again each time: a run that is training makes and removes checkpoints.
+  while left := [x for x in _candidates(run_dir, step) if x not in damaged]:
+    candidate = left[0]
     try:
       record = checkpoint_record.read(run_dir, candidate)
       if config is not None:
@@ -81,10 +83,11 @@ def restore(
         name: _restore_item(run_dir, steps[name], name, example)
         for name, example in examples.items()
       }
-      return Restored(candidate, items, steps, damaged)
+      newer = [line for other, line in damaged.items() if other > candidate]
+      return Restored(candidate, items, steps, newer)
     except DamagedError as error:
-      damaged.append(str(error))
-  raise DamagedError("; ".join(damaged))
+      damaged[candidate] = str(error)
+  raise DamagedError("; ".join(damaged.values()))
 
 
 def _candidates(run_dir: Path, step: int | None) -> list[int]:

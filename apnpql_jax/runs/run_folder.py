@@ -11,7 +11,7 @@ from pathlib import Path
 import shutil
 from typing import Any, NamedTuple
 
-from apnpql_jax.atomic import check_utf8, check_writable
+from apnpql_jax.atomic import check_utf8, check_writable, existing
 from apnpql_jax.config import files
 from apnpql_jax.config.checks import validate
 from apnpql_jax.config.schema import TrainConfig
@@ -84,9 +84,11 @@ def open_run(run_dir: Path) -> RunFolder:
   """
   _check_characters(run_dir, "\\")  # TensorStore reads a backslash as a slash.
   inside = run_dir.resolve()
-  for path in sorted(run_dir.rglob("*")):
-    if path.is_symlink() and not path.resolve().is_relative_to(inside):
-      raise FileError(f"{path} is a link that leads out of the run folder")
+  # A run that is training makes and removes folders; ``walk`` passes over those.
+  for folder, folders, names in os.walk(run_dir):
+    for path in (Path(folder, name) for name in folders + names):
+      if path.is_symlink() and not path.resolve().is_relative_to(inside):
+        raise FileError(f"{path} is a link that leads out of the run folder")
   return RunFolder(run_dir.absolute(), load_run_config(run_dir))
 
 
@@ -278,6 +280,37 @@ def _check_replaceable(run_dir: Path, *, overwrite: bool) -> None:
       f"{str(run_dir)!r} holds a run; resume it with --resume {run_dir}, replace it "
       "with --overwrite, or choose another --run"
     )
+
+
+def check_disk(run_dir: Path, checkpoint_bytes: int, *, kept: int) -> str:
+  """Checks that the disk has room for a checkpoint of at most this size.
+
+  Checkpoints are compressed, so that fewer bytes may do.
+
+  Args:
+    run_dir: The run folder, which may not exist yet.
+    checkpoint_bytes: Size before compression.
+    kept: Number of checkpoints that exist at the same time.
+
+  Returns:
+    A warning if there may be no room for all ``kept``, else "".
+
+  Raises:
+    FileError: There is no room for one.
+  """
+  size = checkpoint_bytes / 2**30
+  free = shutil.disk_usage(existing(run_dir)).free / 2**30
+  if size > free:
+    raise FileError(
+      f"a checkpoint needs up to {size:.2f} GiB, but the disk of {str(run_dir)!r} has "
+      f"{free:.2f} GiB; free some, or lower replay.capacity"
+    )
+  if kept * size > free:
+    return (
+      f"the disk has {free:.2f} GiB, but {kept} checkpoints need up to "
+      f"{kept * size:.2f} GiB; lower keep_checkpoints or replay.capacity"
+    )
+  return ""
 
 
 def _check_characters(run_dir: Path, refused: str) -> None:

@@ -21,7 +21,7 @@ from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.console import print_line, reporting
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.errors import ConfigError, check_name
-from apnpql_jax.runs import checkpoint_reader, leaves, run_folder
+from apnpql_jax.runs import abandoned_tasks, checkpoint_reader, leaves, run_folder
 from apnpql_jax.runs.metrics import wilson_interval
 from apnpql_jax.training.rollout import (
   Episodes,
@@ -154,7 +154,9 @@ def load_trained(
     jnp.zeros(1, jnp.int32),
   )
   devices.check_memory(leaves.nbytes(example), "the learner")
-  found = checkpoint_reader.restore(run_dir, step, {"learner": example}, config=config)
+  with abandoned_tasks.silenced():
+    wanted = {"learner": example}
+    found = checkpoint_reader.restore(run_dir, step, wanted, config=config)
   for line in found.damaged:
     print_line(line)
   return Trained(config, env, agent, found.items["learner"], found.step)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from concurrent import futures
 import contextlib
-import logging
 from pathlib import Path
 import signal
 import threading
@@ -24,7 +23,13 @@ from apnpql_jax.console import print_line
 from apnpql_jax.data import demonstrations, replay
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.errors import ConfigError, RunStopped
-from apnpql_jax.runs import checkpoint_reader, leaves, provenance, run_folder
+from apnpql_jax.runs import (
+  abandoned_tasks,
+  checkpoint_reader,
+  leaves,
+  provenance,
+  run_folder,
+)
 from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
 from apnpql_jax.runs.metrics import MetricWriter
 from apnpql_jax.runs.progress import TrainProgress
@@ -85,7 +90,8 @@ def train(
   signals = Signals(
     f"stopped before the first iteration; {hint if resume else 'nothing is saved'}"
   )
-  with signals if handle_signals else contextlib.nullcontext():
+  handled = signals if handle_signals else contextlib.nullcontext()
+  with handled, abandoned_tasks.silenced():
     reserved = run_folder.reserve(run_dir) if devices.is_primary() else None
     with reserved or contextlib.nullcontext():
       start = _start(config, run_dir, mesh, resume=resume, overwrite=overwrite)
@@ -174,10 +180,6 @@ def _start(
   overwrite: bool,
 ) -> Start:
   """Builds or restores everything; creates the run folder last."""
-  # Orbax and its abandoned tasks log pages of tracebacks when a save fails; the run
-  # reports it in one line.
-  for name in ("absl", "asyncio"):
-    logging.getLogger(name).setLevel(logging.CRITICAL)
   count = mesh.size if mesh else 1
   if resume:
     path = run_folder.open_run(run_dir).path
@@ -190,7 +192,12 @@ def _start(
   agent = make_agent(config.agent)  # Before the worlds, which can take minutes.
   env = make_env(config.env, mesh, instants=config.agent.lstm_instants)
   example = example_state(config, env, agent)
-  devices.check_memory(leaves.nbytes(example), "the training state")
+  size = leaves.nbytes(example)
+  devices.check_memory(size, "the training state")
+  # The newest ones, the best one, and the one being written. A resumed run has most.
+  kept = 1 if saved else config.keep_checkpoints + 2
+  if warning := run_folder.check_disk(run_dir, count * size, kept=kept):
+    _print_line(warning)
   # Compile while the state is being made or read, which also compiles: XLA keeps a
   # second core busy that way.
   background = futures.ThreadPoolExecutor(1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 import dataclasses
 import gc
@@ -25,7 +26,12 @@ import pytest
 from apnpql_jax.config.files import config_to_json
 from apnpql_jax.config.schema import AgentConfig, TrainConfig
 from apnpql_jax.errors import UserError
-from apnpql_jax.runs import checkpoint_reader, checkpoint_record, run_folder
+from apnpql_jax.runs import (
+  abandoned_tasks,
+  checkpoint_reader,
+  checkpoint_record,
+  run_folder,
+)
 from apnpql_jax.runs.checkpoint_writer import CheckpointWriter, SaveError
 from apnpql_jax.training import resume
 
@@ -416,6 +422,45 @@ def test_a_full_disk_leaves_the_checkpoints_before_untouched(tmp_path: Path):
   assert checkpoint_reader.all_steps(tmp_path) == [3]
 
 
+SAVE_ON_A_FULL_DISK = """
+import os, pathlib, resource, sys
+sys.path.insert(0, sys.argv[2])
+import test_checkpoint as t
+from apnpql_jax.runs import abandoned_tasks
+resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 18, -1))
+noise = t.np.random.default_rng(0).integers(0, 256, (8, 1 << 20), t.np.uint8)
+state = {str(i): t.jnp.asarray(x) for i, x in enumerate(noise)}
+with abandoned_tasks.silenced():
+  try:
+    with t.CheckpointWriter(pathlib.Path(sys.argv[1]), t.CONFIG, keep=1) as writer:
+      writer.save(1, {"state": state})
+  except t.SaveError as error:
+    print(error, flush=True)
+    os._exit(3)
+"""
+
+
+def test_a_full_disk_is_reported_by_one_line(tmp_path: Path):
+  here = Path(__file__).parent
+  command = [sys.executable, "-c", SAVE_ON_A_FULL_DISK, str(tmp_path), str(here)]
+  done = subprocess.run(command, cwd=here.parents[1], capture_output=True, text=True)
+  assert done.returncode == 3 and done.stderr == ""
+  assert done.stdout.startswith("checkpoint 1 could not be saved: File too large")
+
+
+def test_a_loop_that_is_open_is_not_silenced():
+  loop, called = asyncio.new_event_loop(), []
+  with abandoned_tasks.silenced():
+    loop.call_soon_threadsafe(called.append, 1)
+    loop.call_soon_threadsafe(loop.stop)
+    loop.run_forever()
+    loop.close()
+    loop.call_soon_threadsafe(called.append, 2)
+  with pytest.raises(RuntimeError, match="closed"):
+    loop.call_soon_threadsafe(called.append, 3)
+  assert called == [1]
+
+
 SAVE_FOR_EVER = """
 import itertools, pathlib, sys
 sys.path.insert(0, sys.argv[2])
@@ -428,6 +473,33 @@ with t.CheckpointWriter(run, t.CONFIG, keep=2) as writer:
     writer.wait()
     print(step, flush=True)
 """
+
+
+def test_a_run_can_be_read_while_it_saves(tmp_path: Path):
+  """With one checkpoint kept, the newest one is removed as soon as the next exists."""
+  run = run_folder.create(tmp_path / "run", CONFIG).path
+  code = SAVE_FOR_EVER.replace("keep=2", "keep=1").replace("200_000", "200")
+  here = Path(__file__).parent
+  command = [sys.executable, "-c", code, str(run), str(here)]
+  with subprocess.Popen(
+    command, cwd=here.parents[1], stdout=subprocess.DEVNULL
+  ) as process:
+    try:
+      while checkpoint_reader.latest_step(run) is None:
+        time.sleep(0.1)
+      last = checkpoint_reader.latest_step(run) or 0
+      for _ in range(15):
+        for _ in range(10):
+          assert run_folder.open_run(run).config == CONFIG
+          assert checkpoint_reader.latest_step(run)
+          checkpoint_reader.best_step(run)
+        found = checkpoint_reader.restore(run, None, {"state": _state(0, images=200)})
+        _assert_same_bits(found.items["state"], _state(found.step % 7, images=200))
+        assert found.step >= last and not found.damaged
+        last = found.step
+    finally:
+      process.kill()
+  assert last > 15
 
 
 @pytest.mark.parametrize(

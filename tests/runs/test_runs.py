@@ -7,6 +7,7 @@ import json
 import os
 from pathlib import Path
 import resource
+import shutil
 import subprocess
 import sys
 import time
@@ -146,6 +147,16 @@ def test_a_run_in_training_is_not_replaced(tmp_path):
       run_folder.check_free(run, overwrite=True)
     process.kill()
   run_folder.check_free(run, overwrite=True)
+
+
+def test_a_disk_without_room_for_a_checkpoint_is_refused(tmp_path):
+  free = shutil.disk_usage(tmp_path).free
+  run = tmp_path / "deep" / "run"
+  assert run_folder.check_disk(run, free // 100, kept=3) == ""
+  warning = run_folder.check_disk(run, free // 2, kept=3)
+  assert "3 checkpoints need up to" in warning and "keep_checkpoints" in warning
+  with pytest.raises(UserError, match="a checkpoint needs up to .* replay.capacity"):
+    run_folder.check_disk(run, 2 * free, kept=1)
 
 
 def test_only_a_run_can_be_overwritten(tmp_path):

@@ -8,6 +8,7 @@ import dataclasses
 import inspect
 import json
 from pathlib import Path
+import shutil
 
 import imageio.v3 as iio
 import numpy as np
@@ -101,6 +102,15 @@ def test_a_second_start_in_one_folder_builds_nothing(tmp_path, monkeypatch, resu
     with pytest.raises(FileError, match="is being trained by another process"):
       train(testing.TINY, run, resume=resume)
   assert run.exists() == resume and not (tmp_path / "cache").exists()
+
+
+def test_a_run_without_room_for_a_checkpoint_is_refused(tmp_path, monkeypatch):
+  """Before the replay is filled; the folder reserved for it is gone."""
+  none = shutil.disk_usage(tmp_path)._replace(free=1000)
+  monkeypatch.setattr(shutil, "disk_usage", lambda _: none)
+  with pytest.raises(FileError, match="a checkpoint needs up to"):
+    train(testing.TINY, tmp_path / "run")
+  assert not any(tmp_path.iterdir())
 
 
 def test_only_the_main_thread_can_be_asked_to_handle_signals(tmp_path):

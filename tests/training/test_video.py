@@ -106,6 +106,13 @@ def test_a_video_that_cannot_be_written_is_an_error(tmp_path):
     video.write_video(tmp_path / "full.mp4", _frames(2, 24, 36), fps=5)
 
 
+@pytest.mark.parametrize("name", ["20:05.mp4", "file:x.mp4", "http:x.gif", "%d #é.mp4"])
+def test_a_name_is_not_taken_for_an_address(tmp_path, monkeypatch, name):
+  monkeypatch.chdir(tmp_path)
+  assert video.write_video(Path(name), _frames(2, 24, 36), fps=5) == Path(name)
+  assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
 def test_a_path_that_ends_in_gif_makes_a_gif(tmp_path):
   frames = _frames(3, 24, 36)
   path = video.write_video(tmp_path / "episode.gif", frames, fps=5)
