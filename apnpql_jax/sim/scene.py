@@ -20,6 +20,7 @@ from apnpql_jax.errors import ConfigError
 ARM_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 GRIPPER_JOINT = "finger_r1"
 TOOL_SITE = "tool"
+BASE_SITE = "base_frame"  # the frame of the arm's controller
 
 
 @dataclasses.dataclass(frozen=True)

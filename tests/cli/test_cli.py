@@ -106,6 +106,7 @@ BAD_INPUT = [
   ("collect push_plate --episodes many", ["--episodes", "'many'"]),
   ("collect push_plate --video runs", ["video", ".mp4", ".gif"]),
   ("collect push_plate --save runs", ["runs is a folder"]),
+  ("collect push_plate --append", ["--append", "need --save"]),
   ("collect push_plate --save none/x.npz", ["none/x.npz is a folder, or in none"]),
   ("collect push_plate --video runs/old/config.json/x.mp4", ["video", "written"]),
   ("evaluate runs/old --video x.avi", ["video", ".mp4", ".gif"]),
