@@ -56,6 +56,5 @@ def test_the_task_of_the_guide_runs(tmp_path: Path):
   figures = json.loads(apnpql(*collect).stdout)
   assert figures["successes"] >= 31 and figures["mean_length"] < 30
   assert figures["demonstrations"] == figures["solved_demonstrations"] >= 31
-  # Added to the file, as a merge of it with itself must not be.
   figures = json.loads(apnpql(*collect, "--append").stdout)
   assert figures["demonstrations"] == figures["solved_demonstrations"] >= 62

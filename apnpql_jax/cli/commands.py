@@ -247,6 +247,7 @@ def _save(
   from apnpql_jax.data import demonstrations
 
   task = tasks.make_task(env.task)
+  demonstrations.check(demos, task.scene)
   if args.solved_only:
     demos = demonstrations.only_solved(demos, task, env)
   if earlier is not None:
