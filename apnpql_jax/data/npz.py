@@ -53,7 +53,7 @@ def check_names(found: Set[str], wanted: Set[str]) -> None:
   lists = {"missing arrays": wanted - found, "unknown arrays": found - wanted}
   faults = [f"{what}: {', '.join(sorted(x))}" for what, x in lists.items() if x]
   if faults:
-    raise FileError("; ".join(faults))
+    raise FileError(f"{'; '.join(faults)} (see docs/demonstrations.md)")
 
 
 def _nbytes(archive: zipfile.ZipFile, name: str) -> int:

@@ -159,15 +159,14 @@ def _compare(
   model: mujoco.MjModel, scene: str, kind: str, name: str, fields: list[str]
 ) -> None:
   """Raises ``ConfigError`` if an element differs from the robot's of this name."""
-  robot = _robot()
-  try:
-    ids = {id(m): getattr(m, kind)(name).id for m in (model, robot)}
-  except KeyError:
-    raise ConfigError(
-      f"{scene}.xml lacks the robot's {kind} '{name}'; include robot.xml unchanged"
-    ) from None
   for field in fields:
-    now, expected = (_value(m, field, ids[id(m)]) for m in (model, robot))
+    expected = _value(_robot(), kind, name, field)
+    try:
+      now = _value(model, kind, name, field)
+    except KeyError:
+      raise ConfigError(
+        f"{scene}.xml lacks the robot's {kind} '{name}'; include robot.xml unchanged"
+      ) from None
     if not np.allclose(now, expected, rtol=1e-6, atol=1e-9):
       cure = _RANGE_CURE if field == "jnt_range" else _CURE
       raise ConfigError(
@@ -176,11 +175,12 @@ def _compare(
       )
 
 
-def _value(model: mujoco.MjModel, field: str, index: int) -> Any:
-  """Returns a field of an element; those of ``dof_`` are of a joint with one."""
-  return getattr(model, field)[
-    model.jnt_dofadr[index] if field.startswith("dof_") else index
-  ]
+def _value(model: mujoco.MjModel, kind: str, name: str, field: str) -> Any:
+  """Returns a field of an element; raises ``KeyError`` if there is no such element."""
+  index = getattr(model, kind)(name).id
+  if field.startswith("dof_"):  # Of a joint with one degree of freedom.
+    index = model.jnt_dofadr[index]
+  return getattr(model, field)[index]
 
 
 def _show(value: Any) -> str:

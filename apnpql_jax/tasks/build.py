@@ -124,7 +124,7 @@ def _describe(value: Any) -> str:
   if not (hasattr(value, "shape") and hasattr(value, "dtype")):
     return type(value).__name__
   kinds = {"f": "float", "i": "int", "u": "int", "b": "bool"}
-  kind = kinds.get(np.dtype(value.dtype).kind, str(value.dtype))
+  kind = kinds.get(getattr(value.dtype, "kind", ""), str(value.dtype))
   return f"{kind}{list(value.shape)}"
 
 

@@ -15,10 +15,13 @@ from apnpql_jax.sim.scene import Scene, load_scene
 INCLUDE = '<include file="arena.xml"/>'
 
 
-def load(folder: Path, text: str) -> Scene:
-  """Loads a scene that is stored next to the robot's files."""
+def load(folder: Path, text: str, **robot: str) -> Scene:
+  """Loads a scene that is stored next to the robot's files, with changed attributes."""
   for name in ("arena", "robot"):
-    (folder / f"{name}.xml").write_text(mjcf_path(name).read_text())
+    content = mjcf_path(name).read_text()
+    for attribute, value in robot.items():
+      content = re.sub(rf'{attribute}="[^"]*"', f'{attribute}="{value}"', content)
+    (folder / f"{name}.xml").write_text(content)
   (folder / "mine.xml").write_text(text)
   return load_scene(folder / "mine.xml")
 
@@ -67,6 +70,18 @@ def test_a_scene_must_not_change_the_robot(tmp_path, text, added, message):
   with pytest.raises(ConfigError, match=f"mine.xml.*({message})") as error:
     load(tmp_path, changed)
   assert "\n" not in str(error.value)
+
+
+def test_a_robot_of_its_own_must_be_the_same(tmp_path, text):
+  load(tmp_path, text)
+  with pytest.raises(
+    ConfigError, match="'shoulder_pan' has damping 5, not 0 as in rob"
+  ):
+    load(tmp_path, text, damping="5")
+  short = mjcf_path("robot").read_text().replace("attachment_site", "flange")
+  (tmp_path / "robot.xml").write_text(short)
+  with pytest.raises(ConfigError, match="lacks the robot's site 'attachment_site'"):
+    load_scene(tmp_path / "mine.xml")
 
 
 @pytest.mark.parametrize(
