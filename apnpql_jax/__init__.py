@@ -20,7 +20,8 @@ if TYPE_CHECKING:
   from apnpql_jax.envs.env import Env, make_env
   from apnpql_jax.errors import ConfigError, FileError, RunStopped, UserError
   from apnpql_jax.runtime import configure
-  from apnpql_jax.tasks.task import Task, make_task, register_task, task_names
+  from apnpql_jax.tasks.build import make_task
+  from apnpql_jax.tasks.task import Task, register_task, task_names
   from apnpql_jax.training.diagnose import diagnose
   from apnpql_jax.training.evaluate import evaluate
   from apnpql_jax.training.train import train
@@ -33,7 +34,8 @@ _MODULES = {
   "envs.env": ("Env", "make_env"),
   "errors": ("ConfigError", "FileError", "RunStopped", "UserError"),
   "runtime": ("configure",),
-  "tasks.task": ("Task", "make_task", "register_task", "task_names"),
+  "tasks.build": ("make_task",),
+  "tasks.task": ("Task", "register_task", "task_names"),
   "training.diagnose": ("diagnose",),
   "training.evaluate": ("evaluate",),
   "training.train": ("train",),

@@ -52,5 +52,9 @@ def test_the_task_of_the_guide_runs(tmp_path: Path):
   assert refused.returncode == 2 and "'push_plate'" in refused.stderr.splitlines()[-1]
   assert "is taken by apnpql_jax.tasks.a_copy" in refused.stderr.splitlines()[-1]
 
-  figures = json.loads(apnpql("collect", "touch_ball", "--episodes", "32").stdout)
+  collect = "collect touch_ball --episodes 32 --save mine.npz --solved-only".split()
+  figures = json.loads(apnpql(*collect).stdout)
   assert figures["successes"] >= 31 and figures["mean_length"] < 30
+  assert figures["demonstrations"] == figures["solved_demonstrations"] >= 31
+  figures = json.loads(apnpql(*collect, "--append").stdout)
+  assert figures["demonstrations"] == figures["solved_demonstrations"] >= 62

@@ -31,6 +31,8 @@ from apnpql_jax.runs import run_folder
 if TYPE_CHECKING:
   from jax.sharding import Mesh
 
+  from apnpql_jax.data.demonstrations import Demonstrations
+
 Json = dict[str, Any]
 
 
@@ -108,18 +110,23 @@ def diagnose(args: Diagnose) -> Json:
 def collect(args: Collect) -> Json:
   """Plays episodes with the scripted expert of a task."""
   _check_free(args.video, overwrite=args.overwrite)
+  if args.save is None and (args.append or args.solved_only):
+    raise ConfigError("--append and --solved-only need --save FILE.npz")
   if args.save is not None:
-    _check_demonstrations(args.save, overwrite=args.overwrite)
+    _check_demonstrations(args.save, overwrite=args.overwrite, append=args.append)
   # The expert acts on privileged poses, so images are not needed.
   env = dataclasses.replace(_task_env(args.task), backend=args.backend, obs="state")
 
+  from apnpql_jax.envs.env import make_env
   from apnpql_jax.training import expert
   from apnpql_jax.training.evaluate import evaluate_expert
 
-  settings = {"episodes": args.episodes, "seed": args.seed, "noise": args.noise}
+  earlier = _earlier(args.save, env) if args.save and args.append else None
+  settings: Json = {"episodes": args.episodes, "seed": args.seed, "noise": args.noise}
   figures = evaluate_expert(env, video=args.video, **settings)
   if args.save is not None:
-    figures |= expert.save_expert(args.save, env, **settings)
+    demos = expert.record_expert(make_env(env), **settings)
+    figures |= _save(args, args.save, env, demos, earlier)
   return figures
 
 
@@ -127,18 +134,26 @@ def convert(args: Convert) -> Json:
   """Converts recorded joint trajectories into demonstrations."""
   if not args.out:
     raise ConfigError("usage: apnpql convert REC.npz TASK OUT.npz")
-  _check_demonstrations(Path(args.out), overwrite=args.overwrite)
+  recording, out = Path(args.recording), Path(args.out)
+  _check_demonstrations(out, overwrite=args.overwrite, append=args.append)
+  if args.append and recording.resolve() == out.resolve():
+    raise ConfigError(f"{out} cannot be added to itself")
   env = _task_env(args.task)
 
   from apnpql_jax import devices, tasks
   from apnpql_jax.data import demonstrations, real_arm
 
   devices.start()
-  scene, period_s = tasks.make_task(args.task).scene, env.control_period_s
-  demos = real_arm.convert(Path(args.recording), scene, period_s=period_s)
-  return demonstrations.save(
-    Path(args.out), demos, task=args.task, control_period_s=period_s
-  )
+  earlier = _earlier(out, env) if args.append else None
+  task = tasks.make_task(args.task)
+  if demonstrations.is_demonstrations(recording):
+    demos = demonstrations.load(recording, task, env, allow_unsolved=True)
+  else:
+    demos = real_arm.convert(recording, task.scene, period_s=env.control_period_s)
+  if not args.allow_unsolved:
+    demonstrations.check_solved(demos, task, env, flag="--allow-unsolved")
+  demonstrations.check_reachable(demos, task)
+  return _save(args, out, env, demos, earlier)
 
 
 def repeat(args: Repeat) -> Json:
@@ -212,12 +227,47 @@ def _existing_run(run: str, command: str) -> Path:
   return Path(run)
 
 
-def _check_demonstrations(path: Path, *, overwrite: bool) -> None:
+def _check_demonstrations(path: Path, *, overwrite: bool, append: bool) -> None:
   """Raises ``ConfigError`` if demonstrations cannot be written, or must not be."""
+  if overwrite and append:
+    raise ConfigError("use either --append or --overwrite")
   if path.is_dir() or not path.absolute().parent.is_dir():
     raise ConfigError(f"{path} is a folder, or in none; name a file to write")
   check_writable(path.absolute().parent)
-  _check_free(path, overwrite=overwrite)
+  _check_free(path, overwrite=overwrite or append)
+
+
+def _earlier(path: Path, env: EnvConfig) -> Demonstrations | None:
+  """Returns the demonstrations in a file, or None if there is no file."""
+  from apnpql_jax import tasks
+  from apnpql_jax.data import demonstrations
+
+  if not path.exists():
+    return None
+  return demonstrations.load(path, tasks.make_task(env.task), env, allow_unsolved=True)
+
+
+def _save(
+  args: Collect | Convert,
+  path: Path,
+  env: EnvConfig,
+  demos: Demonstrations,
+  earlier: Demonstrations | None,
+) -> Json:
+  """Writes demonstrations after ``earlier`` ones; returns the file and its counts."""
+  from apnpql_jax import tasks
+  from apnpql_jax.data import demonstrations
+
+  task = tasks.make_task(env.task)
+  demonstrations.check(demos, task.scene)
+  if args.solved_only:
+    demos = demonstrations.only_solved(demos, task, env)
+  if earlier is not None:
+    demos = demonstrations.join(earlier, demos)
+  period_s = env.control_period_s
+  counts = demonstrations.save(path, demos, task=env.task, control_period_s=period_s)
+  solved = int(demonstrations.solved(demos, task, env).sum())
+  return counts | {"solved_demonstrations": solved}
 
 
 def _check_free(path: Path | None, *, overwrite: bool) -> None:

@@ -152,19 +152,35 @@ class Collect(_Play):
   """Also record as many episodes, started from training resets, to this demonstrations
   file."""
 
+  append: _Flag = False
+  """Add the episodes to --save if it exists."""
+
+  solved_only: _Flag = False
+  """Save only solved episodes."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Convert(_Command):
   """Converts a recording to demonstrations: apnpql convert REC.npz TASK OUT.npz."""
 
   recording: tyro.conf.Positional[str] = ""
-  """Joint trajectories and object poses; see docs/demonstrations.md for the format."""
+  """Joint trajectories and object poses (docs/demonstrations.md), or another
+  demonstrations file."""
 
   task: tyro.conf.Positional[str] = ""
   """Task of the recording; `apnpql list` shows all."""
 
   out: tyro.conf.Positional[str] = ""
   """File to write, for --replay.demonstrations."""
+
+  append: _Flag = False
+  """Add the episodes to the file if it exists."""
+
+  solved_only: _Flag = False
+  """Keep only solved episodes."""
+
+  allow_unsolved: _Flag = False
+  """Write a file of which no episode is solved."""
 
   overwrite: _Flag = False
   """Replace the file if it exists."""

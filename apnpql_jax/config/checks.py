@@ -239,12 +239,17 @@ def _check_replay(config: TrainConfig, memory_bytes: int | None) -> None:
       f"replay.capacity={capacity} must be a multiple of env.worlds * rollout_length = "
       f"{per_iteration}; use {max(1, round(capacity / per_iteration)) * per_iteration}"
     )
+  expert_rows = config.replay.batch_size * config.replay.expert_share
   fewest = config.agent.n_step + 2 + max(config.agent.lstm_instants - 1, 0)
-  if capacity // config.env.worlds < fewest:
-    raise ConfigError(
-      f"replay.capacity={capacity} holds no {config.agent.n_step}-step transition; use "
-      f"at least {fewest * config.env.worlds}"
-    )
+  for name, slots, rows in (
+    ("capacity", capacity, config.replay.batch_size),
+    ("expert_steps", config.replay.expert_steps, expert_rows),
+  ):
+    if rows and slots // config.env.worlds < fewest:
+      raise ConfigError(
+        f"replay.{name}={slots} holds no {config.agent.n_step}-step transition; use at "
+        f"least {fewest * config.env.worlds}"
+      )
   need = replay_bytes(config)
   if memory_bytes is not None and need > memory_bytes:
     raise ConfigError(

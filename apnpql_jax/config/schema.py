@@ -235,6 +235,9 @@ class ReplayConfig:
   demonstrations: str = codec.added("")
   """File of demonstrations (docs/demonstrations.md) instead of the scripted expert."""
 
+  allow_unsolved: bool = codec.added(False, before=True)
+  """Whether to train on demonstrations of which no episode is solved."""
+
   expert_noise: float = 0.03
   """Standard deviation of the noise on the expert's joint velocities (rad/s); at 0.1
   the expert rarely grasps."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
 import math
 from pathlib import Path
 import tokenize
@@ -19,7 +20,7 @@ _ERRORS += (LookupError, SyntaxError, TypeError, tokenize.TokenError)
 
 
 def read(path: Path, *, limit: int) -> dict[str, np.ndarray]:
-  """Reads all arrays of an archive without executing anything in it.
+  """Reads all arrays of an archive, in native byte order, and executes nothing in it.
 
   Raises:
     FileError: The file is not an archive of arrays, is damaged, holds Python objects,
@@ -38,6 +39,23 @@ def read(path: Path, *, limit: int) -> dict[str, np.ndarray]:
     raise FileError(f"{path} is not an .npz archive: {one_line(error)}") from None
 
 
+def names(path: Path) -> list[str]:
+  """Returns the names of the arrays in an archive, or none if it cannot be read."""
+  try:
+    with zipfile.ZipFile(path) as archive:
+      return [name.removesuffix(".npy") for name in archive.namelist()]
+  except _ERRORS:
+    return []
+
+
+def check_names(found: Set[str], wanted: Set[str]) -> None:
+  """Raises ``FileError``, which lists missing and unknown arrays, if there are any."""
+  lists = {"missing arrays": wanted - found, "unknown arrays": found - wanted}
+  faults = [f"{what}: {', '.join(sorted(x))}" for what, x in lists.items() if x]
+  if faults:
+    raise FileError(f"{'; '.join(faults)} (see docs/demonstrations.md)")
+
+
 def _nbytes(archive: zipfile.ZipFile, name: str) -> int:
   """Returns the size of an array in bytes, from its header."""
   with archive.open(name) as file:
@@ -52,4 +70,5 @@ def _nbytes(archive: zipfile.ZipFile, name: str) -> int:
 
 def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
   with archive.open(name) as file:
-    return np.lib.format.read_array(file, allow_pickle=False)
+    array = np.lib.format.read_array(file, allow_pickle=False)
+  return array.astype(array.dtype.newbyteorder("="), copy=False)  # JAX takes no other.

@@ -6,7 +6,9 @@ actions and images are computed from them.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -16,8 +18,19 @@ from apnpql_jax.data import demonstrations, npz
 from apnpql_jax.data.demonstrations import Demonstrations
 from apnpql_jax.errors import FileError, UserError
 from apnpql_jax.sim.physics import MAX_VELOCITY
-from apnpql_jax.sim.scene import Scene, free_joints
+from apnpql_jax.sim.scene import ARM_JOINTS, BASE_SITE, Scene, free_joints
 
+_CONVENTIONS: dict[str, dict[str, Any]] = {
+  "time_unit": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+  "angle_unit": {"rad": 1.0, "deg": math.pi / 180},
+  "length_unit": {"m": 1.0, "mm": 1e-3},
+  "quaternion_order": {"wxyz": [0, 1, 2, 3], "xyzw": [3, 0, 1, 2]},
+  "frame": {"world": False, "base": True},
+}
+"""Array of text -> its valid values, each with what it stands for."""
+
+_BEYOND = 0.05  # share of the gripper's range that a reading may lie outside of it
+_ROUNDING = 1e-3  # periods; a remainder below this is rounding of the clock
 _STILL = 0.02  # change per period of the gripper (0 to 1) that keeps its command
 _LONGEST_GAP_S = 1.0  # between two samples; interpolated
 _LARGEST = 1e30  # magnitude of a number, far below the limit of float32
@@ -28,17 +41,19 @@ def convert(path: Path, scene: Scene, *, period_s: float) -> Demonstrations:
   """Reads a recording (``docs/demonstrations.md``) and samples it every ``period_s``.
 
   Raises:
-    FileError: Poses are missing, a shape is wrong, or the arm moves too fast.
+    FileError: Poses or conventions are missing, a shape is wrong, a value is out of
+      range, or the arm moves too fast.
   """
-  arrays = _read(path, scene.model)
-  variant, episode = arrays.pop("variant"), arrays.pop("episode")
-  starts = np.flatnonzero(np.append(True, episode[1:] != episode[:-1]))
+  arrays = npz.read(path, limit=devices.host_memory() or 1 << 32)
   try:
+    recorded = _read(arrays, scene)
+    variant, episode = recorded.pop("variant"), recorded.pop("episode")
+    starts = np.flatnonzero(np.append(True, episode[1:] != episode[:-1]))
     parts = [
-      _episode({name: array[rows] for name, array in arrays.items()}, scene, period_s)
+      _episode({name: array[rows] for name, array in recorded.items()}, scene, period_s)
       for rows in map(slice, starts, [*starts[1:], len(episode)])
     ]
-    demos = Demonstrations(*(np.concatenate(x) for x in zip(*parts, strict=True)))
+    demos = demonstrations.join(*parts)
     demos = demos._replace(variant=np.full(demos.instants, variant))
     demonstrations.check(demos, scene)
   except UserError as error:
@@ -46,53 +61,128 @@ def convert(path: Path, scene: Scene, *, period_s: float) -> Demonstrations:
   return demos._replace(variant=demos.variant.astype(np.int32))
 
 
-def _read(path: Path, model: mujoco.MjModel) -> dict[str, np.ndarray]:
-  """Reads all arrays, f64[n, ...], with defaults for the optional ones."""
-  arrays = npz.read(path, limit=devices.host_memory() or 1 << 32)
-  bodies = _bodies(model)
-  missing = sorted(bodies.keys() - arrays.keys())
-  if missing:
+def _read(arrays: dict[str, np.ndarray], scene: Scene) -> dict[str, np.ndarray]:
+  """Returns the numbers, f64[n, ...], in the project's units, orders and frame."""
+  bodies = _bodies(scene.model)
+  shapes = {"time": (), "joints": (6,), "gripper": (), **dict.fromkeys(bodies, (7,))}
+  if missing := sorted(bodies.keys() - arrays.keys()):
     raise FileError(
-      f"{path} lacks the poses of {', '.join(missing)}, from which rewards, labels and "
+      f"it lacks the poses of {', '.join(missing)}, from which rewards, labels and "
       "images are computed; record them with the joint angles"
     )
-  shapes = {"time": (), "joints": (6,), "gripper": (), **dict.fromkeys(bodies, (7,))}
-  if unknown := sorted(arrays.keys() - shapes.keys() - {"episode", "variant"}):
-    raise FileError(f"{path} has unknown arrays {unknown}; known: {sorted(shapes)}")
-  count = arrays["time"].shape[:1] if "time" in arrays else ()
+  named = {*_CONVENTIONS, "joint_names", "gripper_range"}
+  npz.check_names(arrays.keys() - {"episode", "variant"}, shapes.keys() | named)
+  count = arrays["time"].shape[:1]
+  numbers = {}
   for name, shape in shapes.items():
-    array = arrays.get(name)
-    numbers = array is not None and array.dtype.kind in "fiu"
-    if not numbers or not count or array.shape != count + shape:
-      raise FileError(f"{path}: {name} must be numbers of shape {['n', *shape]}")
-    arrays[name] = array = np.asarray(array, np.float64)
+    array = arrays[name]
+    if array.dtype.kind not in "fiu" or not count or array.shape != count + shape:
+      expected = f"numbers of shape {['n', *shape]}, with one n for all arrays"
+      raise FileError(
+        f"{name} is {array.dtype}{list(array.shape)}; it must be {expected}"
+      )
+    numbers[name] = array = np.asarray(array, np.float64)
     if not (abs(array) < _LARGEST).all():
-      raise FileError(f"{path}: {name} is not finite")
-    off = abs(np.linalg.norm(array[:, 3:], axis=1) - 1) if name in bodies else 0.0
-    if np.max(off, initial=0.0) > 0.1:
-      raise FileError(f"{path}: a quaternion of {name} is not of unit length")
-  if arrays.setdefault("episode", np.zeros(count)).shape != count:
-    raise FileError(f"{path}: episode must have shape ['n']")
-  variant = arrays.setdefault("variant", np.zeros((), int))
+      raise FileError(f"{name} is not finite")
+  chosen = {name: _convention(arrays, name) for name in _CONVENTIONS}
+  numbers["time"] = numbers["time"] * chosen["time_unit"]
+  joints = numbers["joints"] * chosen["angle_unit"]
+  numbers["joints"] = joints[:, _joint_order(arrays["joint_names"])]
+  numbers["gripper"] = _closed(numbers["gripper"], arrays["gripper_range"])
+  for name in bodies:
+    where, quat = np.split(numbers[name], [3], axis=1)
+    if (abs(np.linalg.norm(quat, axis=1) - 1) > 0.1).any():
+      raise FileError(f"a quaternion of {name} is not of unit length")
+    where, quat = where * chosen["length_unit"], quat[:, chosen["quaternion_order"]]
+    if chosen["frame"]:
+      where, quat = _from_base(scene, where, quat)
+    numbers[name] = np.concatenate([where, quat], axis=1)
+  numbers["episode"] = arrays.get("episode", np.zeros(count))
+  if numbers["episode"].shape != count:
+    raise FileError("episode must have shape ['n']")
+  numbers["variant"] = variant = arrays.get("variant", np.zeros((), int))
   if variant.shape or variant.dtype.kind not in "iu":
-    raise FileError(f"{path}: variant must be one whole number")
-  return arrays
+    raise FileError("variant must be one whole number")
+  return numbers
+
+
+def _convention(arrays: dict[str, np.ndarray], name: str) -> Any:
+  """Returns what the text in array ``name`` stands for."""
+  array, valid = arrays[name], _CONVENTIONS[name]
+  text = _texts(array.reshape(-1))[0] if array.size == 1 else ""
+  if text not in valid:
+    raise FileError(f"{name} must be one of the texts {', '.join(valid)}")
+  return valid[text]
+
+
+def _joint_order(names: np.ndarray) -> list[int]:
+  """Returns the columns of ``ARM_JOINTS``, whose names may have a prefix and suffix."""
+  texts = [text.removesuffix("_joint") for text in _texts(names.reshape(-1))]
+  columns = [
+    [i for i, text in enumerate(texts) if text.endswith(joint)] for joint in ARM_JOINTS
+  ]
+  if len(texts) != len(ARM_JOINTS) or any(len(found) != 1 for found in columns):
+    raise FileError(
+      f"joint_names must name the columns of joints: {', '.join(ARM_JOINTS)}, in their "
+      "order"
+    )
+  return [found[0] for found in columns]
+
+
+def _closed(readings: np.ndarray, limits: np.ndarray) -> np.ndarray:
+  """Returns how far the gripper is closed, f64[n] in [0, 1]."""
+  usable = limits.shape == (2,) and limits.dtype.kind in "fiu"
+  if not usable or not np.isfinite(limits).all() or limits[0] == limits[1]:
+    raise FileError("gripper_range must be the readings of an open and a closed hand")
+  opened, closed = map(float, limits)
+  share = (readings - opened) / (closed - opened)
+  if (off := (share < -_BEYOND) | (share > 1 + _BEYOND)).any():
+    i = int(off.argmax())
+    raise FileError(
+      f"gripper reads {readings[i]:g} at sample {i}, outside of gripper_range "
+      f"({opened:g} open, {closed:g} closed)"
+    )
+  return share.clip(0.0, 1.0)
+
+
+def _from_base(
+  scene: Scene, where: np.ndarray, quat: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+  """Converts poses from the frame of the arm's controller to that of the scene."""
+  data = mujoco.MjData(scene.model)
+  mujoco.mj_kinematics(scene.model, data)
+  base, turn, turned = data.site(BASE_SITE), np.zeros(4), np.zeros(quat.shape)
+  mujoco.mju_mat2Quat(turn, base.xmat)
+  for result, q in zip(turned, np.ascontiguousarray(quat), strict=True):
+    mujoco.mju_mulQuat(result, turn, q)
+  return base.xpos + where @ base.xmat.reshape(3, 3).T, turned
+
+
+def _texts(array: np.ndarray) -> list[str]:
+  """Returns the texts of an array; bytes are decoded, and other types give none."""
+  if array.dtype.kind == "S":
+    array = np.char.decode(array, "ascii", "replace")
+  return array.tolist() if array.dtype.kind == "U" else [""] * array.size
 
 
 def _episode(
   recorded: dict[str, np.ndarray], scene: Scene, period_s: float
 ) -> Demonstrations:
   """Samples one episode at the control period."""
-  model, time = scene.model, recorded["time"]
+  model, time = scene.model, recorded["time"] - recorded["time"][0]
   steps = np.diff(time)
-  if not len(steps) or (steps <= 0).any():
-    raise FileError("time must increase within an episode")
+  if not len(steps):
+    raise FileError("an episode has only one sample")
+  if (steps <= 0).any():
+    raise FileError(
+      "time must increase within an episode (Unix time needs float64 or integers)"
+    )
   if steps.max() > _LONGEST_GAP_S:
     raise FileError(
       f"two samples are {steps.max():.3g} s apart, more than {_LONGEST_GAP_S} s; "
-      "start a new episode there"
+      "correct time_unit, or start a new episode there"
     )
-  at = np.arange(time[0], time[-1] + 1e-9, period_s)
+  at = _instants(time[-1], period_s)
   poses = {name: _at(at, time, recorded[name]) for name in recorded if name != "time"}
   qpos, mocap_pos, mocap_quat = _positions(poses, scene)
   states = (qpos, _velocities(model, qpos, period_s), mocap_pos, mocap_quat)
@@ -104,6 +194,16 @@ def _episode(
   )
 
 
+def _instants(duration_s: float, period_s: float) -> np.ndarray:
+  """Returns the instants f64[n], s: whole periods before the last sample.
+
+  A task is solved at the end, so that instant is kept, wherever the recording starts.
+  The first period may begin before the first sample, which it repeats.
+  """
+  count = max(1, math.ceil(duration_s / period_s - _ROUNDING))
+  return (duration_s - period_s * np.arange(count, -1, -1)).clip(0.0)
+
+
 def _positions(
   poses: dict[str, np.ndarray], scene: Scene
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -111,9 +211,8 @@ def _positions(
   model, n = scene.model, len(poses["joints"])
   qpos = np.tile(model.qpos0, (n, 1))
   qpos[:, scene.arm_qpos] = poses["joints"]
-  closed = poses["gripper"].clip(0.0, 1.0)
   for joint in map(model.joint, _FINGERS):
-    qpos[:, joint.qposadr[0]] = closed * joint.range[1]
+    qpos[:, joint.qposadr[0]] = poses["gripper"] * joint.range[1]
   mocap_pos, mocap_quat = np.zeros((n, model.nmocap, 3)), np.zeros((n, model.nmocap, 4))
   for name, (kind, index) in _bodies(model).items():
     where, quat = np.split(poses[name], [3], axis=1)
@@ -132,10 +231,10 @@ def _actions(joints: np.ndarray, gripper: np.ndarray, period_s: float) -> np.nda
   if abs(velocity).max(initial=0.0) > 1.05 * MAX_VELOCITY:
     raise FileError(
       f"the arm moves at {abs(velocity).max():.2f} rad/s, but actions are limited to "
-      f"{MAX_VELOCITY} rad/s; record it more slowly"
+      f"{MAX_VELOCITY} rad/s; correct angle_unit or time_unit, or record it more slowly"
     )
   action[:-1, :6] = velocity.clip(-MAX_VELOCITY, MAX_VELOCITY)
-  action[:, 6] = _commands(gripper.clip(0.0, 1.0))
+  action[:, 6] = _commands(gripper)
   return action
 
 

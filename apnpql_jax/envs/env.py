@@ -151,10 +151,6 @@ class Env:
     recent = jax.tree.map(push, arrival.recent, state.timestep.observation)
     return state.replace(recent=recent)
 
-  def tool_targets(self, state: PhysicsState) -> tuple[Array, Array, Array]:
-    """Returns ``Task.tool_targets`` of the worlds."""
-    return self.task.tool_targets(state, self._kinematics(state))
-
   def variant(self, rows: Int[Array, " worlds"]) -> Int[Array, " worlds"]:
     """Returns the variants of the scene at rows of the bank."""
     return self._bank.variant[rows]

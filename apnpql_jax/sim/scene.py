@@ -16,10 +16,12 @@ from mujoco import mjx
 import numpy as np
 
 from apnpql_jax.errors import ConfigError
+from apnpql_jax.sim import scene_checks
 
 ARM_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 GRIPPER_JOINT = "finger_r1"
 TOOL_SITE = "tool"
+BASE_SITE = "base_frame"  # the frame of the arm's controller
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,16 +73,19 @@ def load_scene(
   the parsed file, such as the shape of an object, but keep its structure.
 
   Raises:
-    ConfigError: The file does not compile, lacks a joint, site or camera, or uses a
-      feature that MJX would silently ignore.
+    ConfigError: The file does not compile, lacks a joint, site or camera, uses a
+      feature that MJX would silently ignore, or changes the robot.
   """
   models = [_compile(path, edit) for edit in variants or [lambda _: None]]
   model = models[0]
-  _check_supported(model, path.stem)
+  scene_checks.check_supported(model, path.stem)
   joints = [_named_id(model, path.stem, "joint", name) for name in ARM_JOINTS]
   finger = _named_id(model, path.stem, "joint", GRIPPER_JOINT)
   for camera in cameras:
     _named_id(model, path.stem, "camera", camera)
+  for variant in models:
+    scene_checks.check_robot(variant, path.stem)
+    scene_checks.check_keyframes(variant, path.stem)
   return Scene(
     name=path.stem,
     model=model,
@@ -97,35 +102,6 @@ def load_scene(
 def free_joints(model: mujoco.MjModel) -> np.ndarray:
   """Returns the ids of the free joints, i64[n]."""
   return np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
-
-
-def _check_supported(model: mujoco.MjModel, name: str) -> None:
-  """Checks for features that MJX rejects, or accepts without simulating them.
-
-  Source: the MJX-JAX engine of mujoco-mjx 3.17.0 has no code for these.
-  """
-  option, kinds = model.opt, mujoco.mjtIntegrator
-  integrators = kinds.mjINT_EULER, kinds.mjINT_RK4, kinds.mjINT_IMPLICITFAST
-  pgs = mujoco.mjtSolver.mjSOL_PGS
-  sleep = getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0)
-  found = {
-    "option/noslip_iterations": option.noslip_iterations > 0,
-    "option/integrator (valid: Euler, RK4, implicitfast)": (
-      option.integrator not in map(int, integrators)
-    ),
-    "option/solver PGS (valid: CG, Newton)": option.solver == pgs,
-    "option/flag sleep": bool(option.enableflags & int(sleep)),
-    "geom/surfacevel": bool(np.any(getattr(model, "geom_surfacevel", 0))),
-    "actuators with activation (not part of PhysicsState)": model.na > 0,
-    "geom/adhesion": bool(np.any(getattr(model, "geom_adhesion", 0))),
-  }
-  names = [feature for feature, used in found.items() if used]
-  if names:
-    raise ConfigError(f"{name}.xml uses unsupported features: {', '.join(names)}")
-  try:
-    mjx.put_model(model, impl="jax")
-  except NotImplementedError as error:
-    raise ConfigError(f"{name}.xml uses a feature MJX lacks: {error}") from error
 
 
 def _named_id(model: mujoco.MjModel, scene: str, kind: str, name: str) -> int:
@@ -145,10 +121,18 @@ def _compile(
   try:
     spec = mujoco.MjSpec.from_file(str(path))
     edit(spec)
-    return spec.compile()
+    sizes = {key.name: len(key.qpos) for key in spec.keys}
+    model = spec.compile()
   except ValueError as error:
     reason = str(error).splitlines()[0]
     raise ConfigError(f"{path.name} does not compile: {reason}") from error
+  for name, size in sizes.items():  # MuJoCo would complete it silently.
+    if size != model.nq:
+      raise ConfigError(
+        f"{path.name}: keyframe '{name}' has {size} values of qpos, not {model.nq}: "
+        "the arm, the four finger joints, then the other joints in order"
+      )
+  return model
 
 
 def _differences(models: Sequence[mujoco.MjModel]) -> dict[str, np.ndarray]:

@@ -1,3 +1,4 @@
 """Tasks, found through a registry."""
 
-from apnpql_jax.tasks.task import Task, make_task, task_names  # noqa: F401
+from apnpql_jax.tasks.build import make_task  # noqa: F401
+from apnpql_jax.tasks.task import Task, task_names  # noqa: F401

@@ -121,8 +121,8 @@ def task_names() -> list[str]:
   return sorted(_REGISTRY)
 
 
-def make_task(name: str) -> Task:
-  """Builds the task ``name``.
+def task_class(name: str) -> type[Task]:
+  """Returns the class of the task ``name``.
 
   Raises:
     ConfigError: No task has this name, or two files want it.
@@ -130,4 +130,4 @@ def make_task(name: str) -> Task:
   check_name("task", name, task_names())
   if name in _CLASHES:
     raise ConfigError(_CLASHES[name])
-  return _REGISTRY[name]()
+  return _REGISTRY[name]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -11,17 +10,12 @@ import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 import numpy as np
 
-from apnpql_jax.config.schema import EnvConfig, TrainConfig
+from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.data import demonstrations, replay
 from apnpql_jax.data.demonstrations import Demonstrations
 from apnpql_jax.data.replay import Replay
-from apnpql_jax.envs.env import Env, make_env
+from apnpql_jax.envs.env import Env
 from apnpql_jax.envs.state import Arrival, EnvState
-from apnpql_jax.errors import FileError
-from apnpql_jax.primitives import ik
-from apnpql_jax.sim import physics
-from apnpql_jax.sim.physics import PhysicsState
-from apnpql_jax.sim.scene import Scene
 from apnpql_jax.training.placement import place
 from apnpql_jax.training.rollout import (
   add_chunk,
@@ -75,11 +69,13 @@ def replay_from_demonstrations(
   """
   worlds, length = config.env.worlds, _length(config)
   index = np.resize(np.arange(demos.instants), (worlds, length)).T
-  slots = _rows(demos, index)
+  slots = demos.rows(index)
   slots.first[0] = True  # A column may begin within an episode.
   ends = np.append(demos.first[1:], True)[index]
   targets = np.zeros((length, worlds, 3, 6), np.float32)
-  targets[slots.first] = _solve_targets(demos, index[slots.first], env)
+  targets[slots.first] = demonstrations.solve_targets(
+    demos, index[slots.first], env.task
+  )
 
   @jax.jit
   def remake(
@@ -87,7 +83,7 @@ def replay_from_demonstrations(
   ) -> Replay:
     def step(before: EnvState, inputs: tuple) -> tuple[EnvState, Slot]:
       shown, targets, ends = inputs
-      now = _states(shown, env.task.scene)
+      now = shown.states(env.task.scene)
       state = env.observe(Arrival.after(before, now, targets, shown.first))
       timestep = state.timestep
       timestep = timestep.replace(
@@ -102,13 +98,6 @@ def replay_from_demonstrations(
 
   start = env.reset(jnp.zeros(worlds, jnp.int32))
   return remake(start, slots, targets, ends)
-
-
-def save_expert(path: Path, config: EnvConfig, **settings: Any) -> dict[str, Any]:
-  """Saves the episodes of ``record_expert`` and returns a summary."""
-  demos = record_expert(make_env(config), **settings)
-  period_s = config.control_period_s
-  return demonstrations.save(path, demos, task=config.task, control_period_s=period_s)
 
 
 def record_expert(
@@ -151,34 +140,3 @@ def record_expert(
 def _length(config: TrainConfig) -> int:
   """Returns the slots per world of the expert replay."""
   return config.replay.expert_steps // config.env.worlds
-
-
-def _rows(demos: Demonstrations, rows: np.ndarray) -> Demonstrations:
-  """Returns a copy of these instants, with the leading axes of ``rows``."""
-  return Demonstrations(*(x[rows] for x in demos))
-
-
-def _states(demos: Demonstrations, scene: Scene) -> PhysicsState:
-  f32 = {
-    name: jnp.asarray(getattr(demos, name), jnp.float32)
-    for name in ("qpos", "qvel", "mocap_pos", "mocap_quat")
-  }
-  qvel = f32.pop("qvel")
-  state = physics.initial_state(scene, **f32, variant=jnp.asarray(demos.variant))
-  return state.replace(qvel=qvel)
-
-
-def _solve_targets(demos: Demonstrations, rows: np.ndarray, env: Env) -> np.ndarray:
-  """Returns f32[len(rows), 3, 6]: joint targets of the primitives at these rows."""
-  unique, inverse = np.unique(rows, return_inverse=True)
-  state = _states(_rows(demos, unique), env.task.scene)
-  positions, rotations, _ = map(np.asarray, env.tool_targets(state))
-  starts = np.asarray(state.qpos[:, env.task.scene.arm_qpos])
-  targets, residuals = ik.solve_all(starts, positions, rotations)
-  far = (residuals > [ik.POSITION_TOLERANCE, ik.ROTATION_TOLERANCE]).any((1, 2))
-  if far.any():
-    raise FileError(
-      f"demonstrations: the arm cannot reach a primitive's target at instant "
-      f"{unique[far.argmax()]}"
-    )
-  return targets.astype(np.float32)[inverse]

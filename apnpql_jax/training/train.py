@@ -226,7 +226,8 @@ def _expert(config: TrainConfig) -> ExpertReplayMaker:
   if not config.replay.demonstrations:
     return collect_expert
   path, task = Path(config.replay.demonstrations), make_task(config.env.task)
-  demos = demonstrations.load(path, task, config.env.control_period_s)
+  allow = config.replay.allow_unsolved
+  demos = demonstrations.load(path, task, config.env, allow_unsolved=allow)
   slots = config.replay.expert_steps
   _print_line(f"expert replay: {demos.instants} instants of {path} fill {slots} slots")
   return lambda config, env, _: expert.replay_from_demonstrations(demos, config, env)

@@ -111,6 +111,7 @@ BAD_INPUT = [
   ("collect push_plate --episodes many", ["--episodes", "'many'"]),
   ("collect push_plate --video runs", ["video", ".mp4", ".gif"]),
   ("collect push_plate --save runs", ["runs is a folder"]),
+  ("collect push_plate --append", ["--append", "need --save"]),
   ("collect push_plate --save none/x.npz", ["none/x.npz is a folder, or in none"]),
   ("collect push_plate --save /proc/x.npz", ["cannot write to '/proc'"]),
   ("collect push_plate --video runs/old/config.json/x.mp4", ["cannot write", "Not a"]),

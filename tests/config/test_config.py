@@ -45,6 +45,7 @@ ADDED = {
   "wandb_entity": "",
   "wandb_id": "",
   "replay.demonstrations": "",
+  "replay.allow_unsolved": True,
 }
 """Behavior of runs from before these settings existed. No value here may ever
 change. If a default does, pass the old one to ``codec.added``."""
@@ -185,9 +186,15 @@ def test_defaults_of_the_learner_are_the_constants_of_the_paper():
 
 def test_replay_without_room_for_a_transition_is_rejected():
   config = TrainConfig(replay=ReplayConfig(capacity=128), rollout_length=1)
-  with pytest.raises(ConfigError, match="use at least 160"):
+  with pytest.raises(ConfigError, match="capacity=128 .* use at least 160"):
     validate(config)
   validate(changed("replay.capacity", 256))
+  # The same for the expert's share of each batch, if there is any.
+  config = changed("replay.expert_steps", 128)
+  with pytest.raises(ConfigError, match="expert_steps=128 .* use at least 160"):
+    validate(config)
+  validate(replaced(config, ["replay", "expert_share"], 0.0))
+  validate(changed("replay.expert_steps", 160))
 
 
 def test_replay_larger_than_memory_is_rejected():

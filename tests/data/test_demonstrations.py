@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import json
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ from apnpql_jax.data.demonstrations import Demonstrations
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.errors import UserError
 from apnpql_jax.sim.physics import START_TIME, Physics, PhysicsState
+from apnpql_jax.sim.scene import ARM_JOINTS
 from apnpql_jax.training import expert
 from apnpql_jax.training.rollout import expert_policy, make_player
 
@@ -48,6 +51,19 @@ def _record(env: Env) -> Demonstrations:
   return expert.record_expert(env, episodes=EPISODES, seed=0, noise=0.1)
 
 
+def _load(path: Path, env: Env) -> Demonstrations:
+  return demonstrations.load(path, env.task, env.config, allow_unsolved=True)
+
+
+@pytest.fixture(scope="module")
+def whole() -> tuple[Env, Demonstrations]:
+  """Worlds with time to solve the task, and episodes in which the expert does."""
+  env = make_env(testing.TINY.env)
+  demos = expert.record_expert(env, episodes=4, seed=0, noise=0.0)
+  assert demonstrations.solved(demos, env.task, env.config).all()
+  return env, demos
+
+
 @pytest.fixture
 def path(tmp_path, demos) -> Path:
   path = tmp_path / "demos.npz"
@@ -56,7 +72,7 @@ def path(tmp_path, demos) -> Path:
 
 
 def test_a_file_holds_what_was_recorded(path, demos, env):
-  loaded = demonstrations.load(path, env.task, env.config.control_period_s)
+  loaded = _load(path, env)
   assert demos.instants == EPISODES * (STEPS + 1)
   assert demos.first.sum() == EPISODES
   for a, b in zip(loaded, demos, strict=True):
@@ -127,12 +143,7 @@ def test_the_file_has_the_requested_name(tmp_path, demos, env):
       tmp_path / name, demos, task="push_plate", control_period_s=0.15
     )
     assert summary["file"] == str(tmp_path / name)
-    assert (
-      demonstrations.load(
-        Path(summary["file"]), env.task, env.config.control_period_s
-      ).instants
-      == demos.instants
-    )
+    assert _load(Path(summary["file"]), env).instants == demos.instants
   assert len(list(tmp_path.iterdir())) == 3
 
 
@@ -174,10 +185,14 @@ def test_an_episode_ends_where_its_world_breaks(env):
 WRONG = {
   "action": (lambda x: x + 1.5, "action is not within"),
   "qpos": (lambda x: x * np.nan, "qpos is not finite at instant 0"),
-  "qvel": (lambda x: x[:, :-1], r"qvel is float32\[42, 15\], not \[42, 16\]"),
+  "qvel": (lambda x: x[:, :-1], r"qvel is float32\[42, 15\], not float\[42, 16\]"),
+  "mocap_pos": (
+    lambda x: x.astype(int),
+    r"mocap_pos is int64\[.*, not float\[42, 1, 3",
+  ),
   "mocap_quat": (lambda x: x * 2, "quaternion is not of unit length"),
   "variant": (lambda x: x + 1, "variant is not one of the scene's"),
-  "first": (lambda x: ~x, "first instant must begin"),
+  "first": (lambda x: x | True, "first begins an episode at every instant"),
 }
 
 
@@ -187,21 +202,60 @@ def test_states_that_the_scene_cannot_have_are_rejected(path, demos, env, name):
   wrong = demos._replace(**{name: change(getattr(demos, name))})
   demonstrations.save(path, wrong, task="push_plate", control_period_s=0.15)
   with pytest.raises(UserError, match=message):
-    demonstrations.load(path, env.task, env.config.control_period_s)
+    _load(path, env)
 
 
 def test_other_files_are_refused_by_name(path, demos, env):
   demonstrations.save(path, demos, task="stack_box", control_period_s=0.15)
   with pytest.raises(UserError, match="has task stack_box, not push_plate"):
-    demonstrations.load(path, env.task, env.config.control_period_s)
+    _load(path, env)
   demonstrations.save(path, demos, task="push_plate", control_period_s=0.1)
-  with pytest.raises(UserError, match=r"control_period_s 0\.1, not 0\.15"):
-    demonstrations.load(path, env.task, env.config.control_period_s)
+  with pytest.raises(UserError, match=r"control_period_s is 0\.1, not 0\.15"):
+    _load(path, env)
   np.savez(path, format=demonstrations.FORMAT, version=2)
-  with pytest.raises(UserError, match="lacks arrays or has extra ones: action"):
-    demonstrations.load(path, env.task, env.config.control_period_s)
+  with pytest.raises(UserError, match="has version 2, not 1"):
+    _load(path, env)
+  rest = {k: v for k, v in demos._asdict().items() if k not in ("first", "qpos")}
+  np.savez(path, **rest, version=1, format=demonstrations.FORMAT, q=0)
+  with pytest.raises(
+    UserError,
+    match="missing arrays: control_period_s, first, qpos, task; unknown arrays: q .see",
+  ):
+    _load(path, env)
   with pytest.raises(UserError, match="not an .npz archive"):
-    demonstrations.load(path.with_name("none"), env.task, env.config.control_period_s)
+    _load(path.with_name("none"), env)
+
+
+def test_the_order_of_bytes_does_not_matter(path, demos, env):
+  swapped = Demonstrations(*(x.astype(x.dtype.newbyteorder()) for x in demos))
+  demonstrations.save(path, swapped, task="push_plate", control_period_s=0.15)
+  ring = expert.replay_from_demonstrations(_load(path, env), CONFIG, env)
+  expected = expert.replay_from_demonstrations(demos, CONFIG, env)
+  jax.tree.map(np.testing.assert_array_equal, ring, expected)
+
+
+def test_demonstrations_without_a_solved_episode_are_rejected(path, demos, env):
+  with pytest.raises(UserError, match="none of the 6 episodes is solved.*allow-unsol"):
+    demonstrations.load(path, env.task, env.config)
+  assert _load(path, env).instants == demos.instants
+
+
+def test_an_episode_is_solved_within_the_time_limit_and_after_its_start(whole):
+  env, demos = whole
+  begin = np.flatnonzero(demos.first)
+  lengths = np.diff([*begin, demos.instants])
+  limit = 0.15 * sorted(lengths)[1]
+  short = dataclasses.replace(env.config, time_limit_s=limit)
+  expected = lengths - 1 <= short.episode_steps
+  assert 0 < expected.sum() < len(begin)
+  found = demonstrations.solved(demos, env.task, short)
+  np.testing.assert_array_equal(found, expected)
+  # The solved instants on their own: each begins an episode, and a second one is late.
+  ends = demos.rows(np.repeat(np.append(begin[1:], demos.instants) - 1, 2))
+  alone = ends._replace(first=np.ones(len(ends.first), bool))
+  assert not demonstrations.solved(alone, env.task, env.config).any()
+  pairs = ends._replace(first=np.arange(len(ends.first)) % 2 == 0)
+  assert demonstrations.solved(pairs, env.task, env.config).all()
 
 
 @FUZZ
@@ -217,7 +271,7 @@ def test_a_replaced_array_is_rejected(path, env, name, value, shape):
   changed: dict[str, Any] = arrays | {name: np.full(shape, value)}
   np.savez(path, **changed)
   try:
-    demonstrations.load(path, env.task, env.config.control_period_s)
+    _load(path, env)
   except UserError as error:
     assert "\n" not in str(error)
   else:
@@ -226,15 +280,29 @@ def test_a_replaced_array_is_rejected(path, env, name, value, shape):
     np.savez(path, **arrays)
 
 
-def _recording(env: Env, demos: Demonstrations) -> dict[str, Any]:
-  """The episodes as somebody would have measured them, three times as often."""
+CONVENTIONS: dict[str, Any] = {
+  "time_unit": "s",
+  "angle_unit": "rad",
+  "length_unit": "m",
+  "quaternion_order": "wxyz",
+  "frame": "world",
+  "joint_names": np.array(ARM_JOINTS),
+  "gripper_range": np.array([0.0, 1.0]),
+}
+
+
+def _recording(
+  env: Env, demos: Demonstrations, *, every: float = 0.05, late: float = 0.0
+) -> dict[str, Any]:
+  """The episodes as somebody would have measured them: more often, from ``late`` on."""
   free, _ = env.task.scene.free_joint("plate")
   finger = env.task.scene.gripper_qpos
-  times, parts, period = [], [], 0.15
-  for start in np.flatnonzero(demos.first):
-    coarse = period * np.arange(STEPS + 1)
-    fine = np.linspace(0, coarse[-1], 3 * STEPS + 1)
-    rows = slice(start, start + STEPS + 1)
+  times, parts = [], []
+  begin = np.flatnonzero(demos.first)
+  for start, end in zip(begin, [*begin[1:], demos.instants], strict=True):
+    coarse = 0.15 * np.arange(end - start)
+    fine = np.append(np.arange(late, coarse[-1] - 1e-6, every), coarse[-1])
+    rows = slice(start, end)
     plate = demos.qpos[rows, free : free + 7]
     turned = Slerp(coarse, Rotation.from_quat(plate[:, 3:], scalar_first=True))(fine)
     quat = turned.as_quat(scalar_first=True)
@@ -252,13 +320,16 @@ def _recording(env: Env, demos: Demonstrations) -> dict[str, Any]:
       }
     )
   joined = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
-  return joined | {"time": np.concatenate(times)}
+  return CONVENTIONS | joined | {"time": np.concatenate(times)}
+
+
+def _convert(path: Path, env: Env, recording: dict[str, Any]) -> Demonstrations:
+  np.savez(path, **recording)
+  return real_arm.convert(path, env.task.scene, period_s=0.15)
 
 
 def test_a_recording_becomes_the_demonstrations_it_was_made_of(tmp_path, demos, env):
-  path = tmp_path / "recording.npz"
-  np.savez(path, **_recording(env, demos))
-  made = real_arm.convert(path, env.task.scene, period_s=0.15)
+  made = _convert(tmp_path / "recording.npz", env, _recording(env, demos))
   np.testing.assert_array_equal(made.first, demos.first)
   robot = env.task.scene.arm_qpos
   np.testing.assert_allclose(made.qpos[:, robot], demos.qpos[:, robot], atol=1e-5)
@@ -281,20 +352,75 @@ def test_an_even_turn_is_even_between_samples_of_either_sign(tmp_path, demos, en
   quat = turn.as_quat(scalar_first=True) * (-1.0) ** np.arange(6)[:, None]
   place = np.tile(start[free : free + 3], (6, 1))
   goal = np.concatenate([demos.mocap_pos[0, 0], demos.mocap_quat[0, 0]])
-  path = tmp_path / "recording.npz"
-  np.savez(
-    path,
-    time=time,
-    joints=np.tile(start[env.task.scene.arm_qpos], (6, 1)),
-    gripper=np.ones(6),
-    plate=np.concatenate([place, quat], 1),
-    goal=np.tile(goal, (6, 1)),
-    episode=np.zeros(6),
-  )
-  made = real_arm.convert(path, env.task.scene, period_s=0.15)
+  recording = {
+    "time": time,
+    "joints": np.tile(start[env.task.scene.arm_qpos], (6, 1)),
+    "gripper": np.ones(6),
+    "plate": np.concatenate([place, quat], 1),
+    "goal": np.tile(goal, (6, 1)),
+    "episode": np.zeros(6),
+  }
+  made = _convert(tmp_path / "recording.npz", env, CONVENTIONS | recording)
   found = Rotation.from_quat(made.qpos[:, free + 3 : free + 7], scalar_first=True)
-  angle = 0.5 * 0.15 * np.arange(7)
+  angle = 0.5 * np.append(0.0, 1.0 - 0.15 * np.arange(6, -1, -1))
   np.testing.assert_allclose(found.as_rotvec()[:, 2], angle, atol=1e-4)
+
+
+def test_the_same_episodes_are_solved_wherever_recording_and_clock_start(
+  tmp_path, whole
+):
+  """Only the first period differs, in which the recording begins."""
+  env, demos = whole
+  path, expected = tmp_path / "recording.npz", None
+  for late, origin in itertools.product((0.0, 0.04, 0.11), (0.0, 1.7e9)):
+    recording = _recording(env, demos, every=0.008, late=late)
+    recording["time"] += origin
+    made = _convert(path, env, recording)
+    np.testing.assert_array_equal(made.first, demos.first)
+    last = np.append(demos.first[1:], True)
+    np.testing.assert_allclose(made.qpos[last], demos.qpos[last], atol=2e-3)
+    found = demonstrations.solved(made, env.task, env.config)
+    expected = found if expected is None else expected
+    np.testing.assert_array_equal(found, expected)
+  assert expected is not None and expected.sum() >= 2
+
+
+def test_units_orders_and_frame_are_converted(tmp_path, demos, env):
+  """As a UR driver and a Robotiq hand publish them, and a tracker at the arm's base."""
+  path, plain = tmp_path / "recording.npz", _recording(env, demos)
+  expected = _convert(path, env, plain)
+  order = [2, 1, 0, 3, 4, 5]
+  other = plain | {
+    "time": (1.7e18 + 1e9 * plain["time"]).astype(np.int64),
+    "time_unit": "ns",
+    "joints": np.degrees(plain["joints"][:, order]),
+    "joint_names": np.array([f"ur5e_{ARM_JOINTS[i]}_joint" for i in order], "S"),
+    "angle_unit": np.array([b"deg"]),
+    "gripper": 255 - (252 * plain["gripper"]).astype(int),
+    "gripper_range": np.array([255, 3]),
+    "length_unit": "mm",
+    "quaternion_order": "xyzw",
+    "frame": "base",
+  }
+  turn = Rotation.from_euler(
+    "z", 90, degrees=True
+  )  # World to base, see mjcf/robot.xml.
+  for name in ("plate", "goal"):
+    where, quat = np.split(plain[name], [3], axis=1)
+    turned = turn * Rotation.from_quat(quat, scalar_first=True)
+    other[name] = np.concatenate([1e3 * turn.apply(where), turned.as_quat()], axis=1)
+  made = _convert(path, env, other)
+  arm = env.task.scene.arm_qpos
+  np.testing.assert_allclose(made.qpos[:, arm], expected.qpos[:, arm], atol=1e-5)
+  np.testing.assert_allclose(made.qpos[:, 6:10], expected.qpos[:, 6:10], atol=6e-3)
+  np.testing.assert_allclose(made.qpos[:, 10:13], expected.qpos[:, 10:13], atol=1e-5)
+  for a, b in (
+    (made.qpos[:, 13:], expected.qpos[:, 13:]),
+    (made.mocap_quat[:, 0], expected.mocap_quat[:, 0]),
+  ):
+    np.testing.assert_allclose(abs((a * b).sum(1)), 1.0, atol=1e-5)
+  np.testing.assert_allclose(made.mocap_pos, expected.mocap_pos, atol=1e-6)
+  np.testing.assert_allclose(made.action, expected.action, atol=1e-4)
 
 
 def test_an_incomplete_recording_is_rejected_by_name(tmp_path, demos, env):
@@ -304,28 +430,44 @@ def test_an_incomplete_recording_is_rejected_by_name(tmp_path, demos, env):
     changed: dict[str, Any] = {
       k: v for k, v in (whole | changes).items() if v is not None
     }
-    np.savez(path, **changed)
     with pytest.raises(UserError, match=match):
-      real_arm.convert(path, env.task.scene, period_s=0.15)
+      _convert(path, env, changed)
 
   refused("lacks the poses of goal, plate, from which rewards", plate=None, goal=None)
   refused("time must increase", time=-whole["time"])
-  refused("joints must be numbers of shape", joints=whole["joints"][:, :5])
+  refused("joints is float64.*must be numbers of", joints=whole["joints"][:, :5])
   refused("moves at .* rad/s", joints=5 * whole["joints"])
-  refused("unknown arrays .'camera'", camera=np.zeros(3))
+  refused("recording.npz: unknown arrays: camera .see docs/", camera=np.zeros(3))
   refused("gripper is not finite", gripper=whole["gripper"] * np.nan)
-  refused("time must be numbers", time=None)
-  refused("time must be numbers", time=np.array(0.0))
+  refused("missing arrays: time .see docs/", time=None)
+  refused("time is float64", time=np.array(0.0))
+  refused("Unix time needs float64", time=(1.7e9 + whole["time"]).astype("f4"))
   refused("quaternion of plate is not of unit", plate=0 * whole["plate"])
   refused("variant must be one whole number", variant=np.zeros(2, int))
   refused("variant is not one of the scene's", variant=np.array(2**40))
   # Two instants a year apart ask for no memory.
-  refused("two samples are 500 s apart", time=1e4 * whole["time"])
+  refused("two samples are 500 s apart.*time_unit", time=1e4 * whole["time"])
+  refused("an episode has only one sample", episode=np.arange(len(whole["time"])))
+  # Conventions are never guessed.
+  for name in CONVENTIONS:
+    refused(f"missing arrays: {name} .see docs/", **{name: None})
+  refused("time_unit must be one of the texts s, ms", time_unit=np.array("minutes"))
+  refused("quaternion_order must be .* wxyz, xyzw", quaternion_order=np.array(1))
+  refused("frame must be one of .* world, base", frame=np.array(["world", "base"]))
+  names = np.array(ARM_JOINTS)
+  refused("joint_names must name", joint_names=names[:5])
+  refused("joint_names must name", joint_names=names[[0, 0, 2, 3, 4, 5]])
+  refused("joint_names must name", joint_names=np.arange(6))
+  refused("gripper reads 255 at sample 0", gripper=255 * np.ones(len(whole["time"])))
+  refused("readings of an open and a closed", gripper_range=np.array([1.0, 1.0]))
+  refused("correct angle_unit", joints=np.degrees(whole["joints"]))
 
 
 @FUZZ
 @given(
-  st.sampled_from("time joints gripper plate goal episode variant".split()),
+  st.sampled_from(
+    [*"time joints gripper plate goal episode variant".split(), *CONVENTIONS]
+  ),
   st.one_of(
     st.integers(-(2**62), 2**62), st.floats(), st.text(max_size=5), st.booleans()
   ),
@@ -336,25 +478,78 @@ def test_a_recording_is_refused_in_one_line_or_becomes_demonstrations(
 ):
   """One array in place of another, or one number in place of another."""
   whole, path = _recording(env, demos), tmp_path / "recording.npz"
-  if shape is None and name != "variant" and not isinstance(value, str):
+  scalar = name == "variant" or name in CONVENTIONS
+  if shape is None and not scalar and not isinstance(value, str):
     whole[name] = np.asarray(whole[name], np.float64)
     whole[name].flat[7] = value
   else:
     whole[name] = np.full(shape or (), value)
-  np.savez(path, **whole)
   try:
-    made = real_arm.convert(path, env.task.scene, period_s=0.15)
+    made = _convert(path, env, whole)
   except UserError as error:
     assert "\n" not in str(error) and str(path) in str(error)
   else:
     demonstrations.check(made, env.task.scene)
 
 
-def test_the_command_converts_a_recording(tmp_path, demos, env):
+def test_the_command_converts_a_recording(tmp_path, whole, capfd):
+  env, demos = whole
   recording, out = tmp_path / "recording.npz", tmp_path / "mine.npz"
   np.savez(recording, **_recording(env, demos))
-  assert main.main(["convert", str(recording), "push_plate", str(out)]) == 0
-  assert (
-    demonstrations.load(out, env.task, env.config.control_period_s).instants
-    == demos.instants
-  )
+  command = ["convert", str(recording), "push_plate", str(out)]
+  assert main.main([*command, "--json"]) == 0
+  counts = json.loads(capfd.readouterr().out)
+  assert counts["demonstrations"] == 4 and counts["solved_demonstrations"] >= 2
+  loaded = demonstrations.load(out, env.task, env.config)
+  assert loaded.instants == demos.instants
+
+
+def test_the_command_refuses_what_training_would(tmp_path, whole, capfd):
+  env, demos = whole
+  recording, out = tmp_path / "recording.npz", tmp_path / "mine.npz"
+  wrong = _recording(env, demos)
+  wrong["goal"][:, 0] += 0.1
+  np.savez(recording, **wrong)
+  command = ["convert", str(recording), "push_plate", str(out)]
+  assert main.main(command) == 2
+  assert "none of the 4 episodes is solved" in capfd.readouterr().err
+  assert not out.exists()
+  assert main.main([*command, "--allow-unsolved"]) == 0
+  with pytest.raises(UserError, match="none of the 4 episodes"):
+    demonstrations.load(out, env.task, env.config)
+  # Objects out of the arm's reach.
+  far = _recording(env, demos)
+  far["plate"][:, 0] += 2.0
+  far["goal"][:, 0] += 2.0
+  np.savez(recording, **far)
+  assert main.main([*command, "--overwrite"]) == 2
+  assert "the arm cannot reach a primitive's target" in capfd.readouterr().err
+
+
+def test_files_are_merged_and_unsolved_episodes_left_out(tmp_path, whole, demos, capfd):
+  env, solved = whole
+  some, all_of_them = tmp_path / "some.npz", tmp_path / "all.npz"
+  both = demonstrations.join(demos, solved)
+  demonstrations.save(some, both, task="push_plate", control_period_s=0.15)
+
+  def counts(*options: str, code: int = 0) -> tuple[int, int]:
+    command = ["convert", str(some), "push_plate", str(all_of_them), "--json"]
+    assert main.main([*command, *options]) == code
+    found = json.loads(capfd.readouterr().out) if not code else {}
+    return found.get("demonstrations", 0), found.get("solved_demonstrations", 0)
+
+  assert counts("--solved-only") == (4, 4)
+  for a, b in zip(_load(all_of_them, env), solved, strict=True):
+    np.testing.assert_array_equal(a, b)
+  assert counts("--append") == (4 + EPISODES + 4, 8)
+  joined = demonstrations.join(solved, both)
+  for a, b in zip(_load(all_of_them, env), joined, strict=True):
+    np.testing.assert_array_equal(a, b)
+  before = all_of_them.read_bytes()
+  counts("--append", "--overwrite", code=2)
+  demonstrations.save(some, demos, task="push_plate", control_period_s=0.15)
+  counts("--append", "--solved-only", "--allow-unsolved", code=2)
+  assert "none of the 6 episodes is solved" in capfd.readouterr().err
+  assert all_of_them.read_bytes() == before
+  assert main.main(["convert", str(some), "push_plate", str(some), "--append"]) == 2
+  assert "cannot be added to itself" in capfd.readouterr().err

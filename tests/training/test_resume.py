@@ -67,9 +67,8 @@ def test_a_run_killed_at_random_times_ends_like_an_undisturbed_one(tmp_path, kil
     _write_demonstrations(path)
 
   # During compilation there is nothing to save, so a signal ends the process at once.
-  process = testing.start(
-    run, *FOR_EVER, "--replay.demonstrations", str(demos), log=log
-  )
+  options = ["--replay.allow-unsolved", "--replay.demonstrations"]
+  process = testing.start(run, *FOR_EVER, *options, str(demos), log=log)
   _wait(process, log, "compiling")
   process.send_signal(signal.SIGINT)
   assert process.wait(30) == 128 + signal.SIGINT
@@ -107,7 +106,7 @@ def test_a_run_killed_at_random_times_ends_like_an_undisturbed_one(tmp_path, kil
   # Evaluations must not affect training.
   total = str(testing.rows(run)[-1]["step"] + 16 * testing.STEPS)
   other = ["--total-steps", total, "--eval-episodes", "2"]
-  other += ["--replay.demonstrations", str(same)]
+  other += [*options, str(same)]
   straight, straight_log = tmp_path / "straight", tmp_path / "straight_log"
   together = [
     testing.start(run, "--total-steps", total, log=log),
