@@ -69,7 +69,7 @@ BAD_INPUT = [
   ("train push_plate --obs depth", ["'depth'", "pixels", "state"]),
   ("train push_plate --env.task juggle", ["'juggle'", "push_plate"]),
   ("train push_plate --algorithm ppo", ["'ppo'", "ap_npql"]),
-  ("train push_plate --agent.epsilon 4.7", ["agent.epsilon", "log(100) = 4.605"]),
+  ("train push_plate --agent.epsilon 3.5", ["agent.epsilon", "log(30) = 3.401"]),
   ("train push_plate --agent.gamma nan", ["agent.gamma", "finite"]),
   ("train push_plate --replay.capacity 1000", ["replay.capacity", "1024"]),
   ("train push_plate --replay.capacity 2147483392", ["GiB", "replay.capacity"]),
