@@ -13,6 +13,9 @@ CONFIG = TrainConfig(
     algorithm="ap_npql",
     n_step=5,
     epsilon=1.0,
+    target_samples=30,
+    policy_samples=30,
+    candidate_precision="bfloat16",
     min_alpha=0.01,
     epsilon_nu=-14.0,
     min_std=0.01,
@@ -28,10 +31,11 @@ CONFIG = TrainConfig(
   replay=ReplayConfig(
     capacity=25_600, expert_steps=6_400, expert_share=0.5, batch_size=64
   ),
-  total_steps=30_720,
+  total_steps=20_480,
   rollout_length=4,
   updates_per_iteration=32,
   eval_every=5_120,
   eval_episodes=64,
+  eval_acting="mean",
   checkpoint_every=10_240,
 )

@@ -9,6 +9,7 @@ from jaxtyping import PRNGKeyArray, UInt8
 from apnpql_jax.types import Array, Observation, Transition
 
 
+@jax.named_scope("augment")
 def augment(
   key: PRNGKeyArray,
   batch: Transition,

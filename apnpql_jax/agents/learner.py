@@ -25,6 +25,9 @@ from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.dists import boltzmann
 from apnpql_jax.types import Array, Metrics, Observation, Transition
 
+FINAL_RATE = 0.1
+"""Share of a learning rate that is left after ``agent.decay_updates``."""
+
 
 class LearnerState(struct.PyTreeNode):
   """Complete state of the learner."""
@@ -141,13 +144,23 @@ def make_optimizer(
     clip = optax.clip_by_global_norm(config.max_grad_norm)
     return optax.chain(clip, optax.adam(learning_rate))
 
+  decay = config.decay_updates
+  cosine = optax.cosine_decay_schedule(1.0, max(decay, 1), FINAL_RATE)
+
+  def e_rate(count: Any) -> Any:
+    return config.learning_rate_e * cosine(count)
+
   def m_rate(count: Any) -> Any:
-    return jnp.where(count < config.m_step_delay, 0.0, config.learning_rate_m)
+    rate = config.learning_rate_m * (cosine(count) if decay else 1.0)
+    return jnp.where(count < config.m_step_delay, 0.0, rate)
+
+  # A constant rate needs no counter in the state of the optimizer.
+  first = e_rate if decay else config.learning_rate_e
 
   rates = {
-    "e_step": config.learning_rate_e,
+    "e_step": first,
     "m_step": m_rate,
-    "policy": config.learning_rate_e,
+    "policy": first,
     "alpha": config.learning_rate_alpha,
     "nu": config.learning_rate_nu,
   }
@@ -156,6 +169,7 @@ def make_optimizer(
   return optax.partition({k: adam(rates[k]) for k in labels.values()}, labels)
 
 
+@jax.named_scope("apply_gradients")
 def apply_gradients(
   optimizer: optax.GradientTransformation,
   state: LearnerState,
@@ -176,6 +190,7 @@ def apply_gradients(
   return LearnerState(params, target_params, nu, opt_state, state.step + 1)
 
 
+@jax.named_scope("bellman_target")
 def bellman_target(
   networks: Networks,
   algorithm: Algorithm,
@@ -195,6 +210,7 @@ def bellman_target(
   return evaluation.target(policy_at, batch)
 
 
+@jax.named_scope("total_loss")
 def total_loss(
   networks: Networks,
   algorithm: Algorithm,

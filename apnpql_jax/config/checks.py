@@ -46,8 +46,8 @@ _POSITIVE = (
 ).split()
 _NOT_NEGATIVE = (
   "agent.learning_rate_m agent.learning_rate_alpha agent.learning_rate_nu "
-  "agent.lambda_ap agent.m_step_delay agent.residual_blocks replay.expert_steps "
-  "replay.expert_noise seed save_replay_every"
+  "agent.lambda_ap agent.m_step_delay agent.decay_updates agent.residual_blocks "
+  "replay.expert_steps replay.expert_noise seed save_replay_every"
 ).split()
 _BOUNDS = {
   # A quarter of the bank is held out for evaluation. Bank and atoms are computed on the

@@ -85,6 +85,10 @@ class AgentConfig:
   learning_rate_nu: float = 1e-4
   """Adam learning rate of the multiplier nu (dual of the entropy floor)."""
 
+  decay_updates: int = codec.added(0)
+  """Updates after which the learning rates of E-step and M-step have fallen to a tenth,
+  along a cosine; 0: they are constant."""
+
   target_rate: float = 0.05
   """Step size of the moving average that makes the target network."""
 

@@ -69,6 +69,14 @@ def make_iteration(config: TrainConfig, env: Env, agent: Agent) -> Iteration:
   return jax.jit(iteration, donate_argnums=0)
 
 
+def compile_iteration(
+  config: TrainConfig, env: Env, agent: Agent, example: TrainState
+) -> Iteration:
+  """Returns ``make_iteration`` compiled for the shapes and placement of ``example``."""
+  jitted: Any = make_iteration(config, env, agent)
+  return jitted.lower(example).compile()
+
+
 def _update(
   agent: Agent,
   sample: Sample,

@@ -5,6 +5,7 @@ It keeps no state; everything needed to resume is in ``TrainState``.
 
 from __future__ import annotations
 
+from concurrent import futures
 import contextlib
 from pathlib import Path
 import signal
@@ -37,7 +38,7 @@ from apnpql_jax.runs.sinks import check_sinks, make_sinks
 from apnpql_jax.tasks import make_task, task_names
 from apnpql_jax.training import expert, skipped_updates
 from apnpql_jax.training.expert import ExpertReplayMaker, collect_expert
-from apnpql_jax.training.iteration import make_iteration
+from apnpql_jax.training.iteration import Iteration, compile_iteration
 from apnpql_jax.training.reporter import Reporter
 from apnpql_jax.training.resume import restore, set_aside, to_items
 from apnpql_jax.training.state import TrainState, example_state, initial_state
@@ -48,6 +49,7 @@ class Start(NamedTuple):
 
   env: Env
   agent: Agent
+  iteration: futures.Future[Iteration]  # compiled
   path: Path  # of the run folder, absolute
   state: TrainState
   resume_step: int | None  # None for a new run
@@ -160,10 +162,8 @@ def _run(
       reporter = Reporter(config, env, start.agent, path, writer, progress)
     saver = CheckpointWriter(path, config, keep=config.keep_checkpoints)
     stack.enter_context(saver)
-    iteration: Any = make_iteration(config, start.env, start.agent)
-    if start.env.mesh is not None:
-      iteration = iteration.lower(start.state).compile()
-      devices.barrier()
+    iteration = start.iteration.result()
+    devices.barrier()
     state = _loop(config, start, iteration, reporter, saver, signals)
     figures = saver.finished(wait=True)
     if reporter and figures:
@@ -198,9 +198,14 @@ def _start(
   kept = 1 if saved else config.keep_checkpoints + 2
   if warning := run_folder.check_disk(run_dir, count * size, kept=kept):
     _print_line(warning)
+  # Compile while the state is being made or read, which also compiles: XLA keeps a
+  # second core busy that way.
+  background = futures.ThreadPoolExecutor(1)
+  iteration = background.submit(compile_iteration, config, env, agent, example)
+  background.shutdown(wait=False)
   if fill is None:
     state = restore(config, run_dir, example, _print_line)
-    return Start(env, agent, path, state, int(state.env_steps))
+    return Start(env, agent, iteration, path, state, int(state.env_steps))
   _print_line("filling the expert replay")
   state = initial_state(config, env, agent, fill)
   if state.expert_replay is not None:
@@ -208,11 +213,12 @@ def _start(
     _print_line(f"expert replay: {solved} of {ended} episodes solved")
   if resume:
     _print_line("the run has no checkpoint yet and starts from the beginning")
-    return Start(env, agent, path, state, 0)
+    return Start(env, agent, iteration, path, state, 0)
   devices.run_on_primary(
     lambda: run_folder.create(run_dir, config, overwrite=overwrite, devices=count)
   )
-  return Start(env, agent, run_folder.open_run(run_dir).path, state, None)
+  path = run_folder.open_run(run_dir).path
+  return Start(env, agent, iteration, path, state, None)
 
 
 def _expert(config: TrainConfig) -> ExpertReplayMaker:

@@ -64,8 +64,11 @@ def changed(config: TrainConfig, section: str, **values: Any) -> TrainConfig:
 
 
 def with_candidates(config: TrainConfig, count: int) -> TrainConfig:
-  """Returns the same training with another number of candidates."""
+  """Returns the same training with another number of candidates in the target.
+
+  The policy has five for six of them, as in the paper, 100 for 120.
+  """
   # Epsilon must stay below the log of the candidates; it costs no time.
   epsilon = min(config.agent.epsilon, 1.0)
-  counts = {"target_samples": count, "policy_samples": count}
+  counts = {"target_samples": count, "policy_samples": max(2, count * 5 // 6)}
   return changed(config, "agent", **counts, epsilon=epsilon)

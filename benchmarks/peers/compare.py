@@ -49,6 +49,8 @@ _STEPS = ("cameras", "physics")
 _WORLDS = {"side": "worlds", "backend": "auto", "stock": False, "periods": 4}
 # Small, because stock MJX takes seconds for a control period of a few worlds on a CPU.
 _MJX = _WORLDS | {"backend": "mjx", "periods": 1, "worlds": 16}
+_LEARNER = {"side": "learner", "precision": "float32"}
+_BFLOAT16 = _LEARNER | {"precision": "bfloat16"}
 
 PEERS = {
   "pybullet": Peer(
@@ -71,7 +73,15 @@ PEERS = {
   ),
   "torch": Peer(
     "the same learner in plain PyTorch: eager mode, Adam, library distributions",
-    *("torch_learner", ("updates",), {"side": "learner"}, {}),
+    *("torch_learner", ("updates",), _LEARNER, {"compiled": False}),
+  ),
+  "torch_bfloat16": Peer(
+    "the same, with our candidates in bfloat16, as in the presets",
+    *("torch_learner", ("updates",), _BFLOAT16, {"compiled": False}),
+  ),
+  "torch_compiled": Peer(
+    "the same in float32, PyTorch under torch.compile",
+    *("torch_learner", ("updates",), _LEARNER, {"compiled": True}),
   ),
 }
 

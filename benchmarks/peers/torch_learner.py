@@ -1,14 +1,14 @@
 """AP-NPQL in plain PyTorch: the same networks, candidates, losses and optimizers.
 
-A side of compare.py: eager mode, float32, all cores or the GPU, as most learners in
-PyTorch run. As in this project, features are computed once per observation, and the
-first layer of Z is split. Distributions and convolutions are those of the library.
-Limits are plain clips, and the entropy of the prior is the mean of its components.
+A side of compare.py: float32, all cores or the GPU, in eager mode, as most learners in
+PyTorch run, or under ``torch.compile``. As in this project, features are computed once
+per observation, and the first layer of Z is split. Distributions and convolutions are
+those of the library. Limits are plain clips, and the entropy of the prior is the mean
+of its components.
 """
 
 from collections.abc import Iterator
 import copy
-import dataclasses
 import itertools
 import math
 
@@ -20,6 +20,7 @@ import torch.nn.functional as F
 
 from apnpql_jax.config.files import load_preset
 from apnpql_jax.config.schema import AgentConfig
+from benchmarks.common.settings import with_candidates
 from benchmarks.peers import sides
 
 JOINTS, PRIMITIVES, ACTION = 6, 3, 7
@@ -280,11 +281,10 @@ def random_batch(count: int, device: str) -> Batch:
 def build(settings: sides.Settings) -> sides.Built:
   """Builds the learner of a preset."""
   device = "cuda" if torch.cuda.is_available() else "cpu"
-  count = settings["candidates"]
-  config = dataclasses.replace(
-    load_preset(settings["preset"]).agent, target_samples=count, policy_samples=count
-  )
-  learner, batch = Learner(config, device), random_batch(settings["batch"], device)
+  config = with_candidates(load_preset(settings["preset"]), settings["candidates"])
+  learner = Learner(config.agent, device)
+  batch = random_batch(settings["batch"], device)
+  update = torch.compile(learner.update) if settings["compiled"] else learner.update
   threads = torch.get_num_threads()
   about = {"version": torch.__version__, "device": device, "threads": threads}
-  return {"updates": sides.rate_of(lambda: learner.update(batch), 1)}, about
+  return {"updates": sides.rate_of(lambda: update(batch), 1)}, about

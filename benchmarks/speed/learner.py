@@ -4,8 +4,9 @@
   python -m benchmarks.speed.learner --batch 64 --candidates 120 --lstm-instants 4
 
 The agent is that of a preset; its transitions are noise. The features phi of a state
-are computed once and serve all candidate actions. "repeated" is the same learner, but
-it encodes the images again for each candidate, which the paper avoids.
+are computed once and serve all candidate actions. "bfloat16" is the same learner with
+``agent.candidate_precision`` bfloat16. "repeated" encodes the images again for each
+candidate, which the paper avoids.
 """
 
 import argparse
@@ -53,6 +54,7 @@ def measure_all(config: TrainConfig, args: argparse.Namespace) -> Iterator[Resul
   for batch, candidates in itertools.product(args.batch, args.candidates):
     chosen = settings.changed(config, "replay", batch_size=batch)
     chosen = settings.with_candidates(chosen, candidates)
+    chosen = settings.changed(chosen, "agent", candidate_precision="float32")
     transitions = noise.transitions(chosen)
     ready = {phi: prepare(AGENTS[phi](chosen.agent), transitions) for phi in args.phi}
     found = timing.figures("update", ready, repeats=args.repeats)
@@ -132,8 +134,13 @@ def forgetful_agent(config: AgentConfig) -> Agent:
     return make_agent(config)
 
 
-AGENTS = {"once": make_agent, "repeated": forgetful_agent}
-"""How often phi is computed -> the agent."""
+def bfloat16_agent(config: AgentConfig) -> Agent:
+  """Returns the agent whose candidates are valued in bfloat16 products."""
+  return make_agent(dataclasses.replace(config, candidate_precision="bfloat16"))
+
+
+AGENTS = {"once": make_agent, "bfloat16": bfloat16_agent, "repeated": forgetful_agent}
+"""How often phi is computed, or in which precision the candidates -> the agent."""
 
 
 if __name__ == "__main__":

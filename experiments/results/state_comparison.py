@@ -113,6 +113,7 @@ def options_of(row: str, seed: int) -> list[str]:
   algorithm, flags, budget = ROWS[row]
   options = (
     f"--env.obs state --agent.algorithm {algorithm} --seed {seed} --no-video "
+    "--eval-acting policy --agent.candidate-precision float32 "
     f"--total-steps {budget * STEPS} --eval-every {budget * STEPS // EVALUATIONS} "
     f"--agent.target-samples {CANDIDATES} --agent.policy-samples {CANDIDATES} {flags}"
   )

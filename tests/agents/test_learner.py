@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -99,6 +100,25 @@ def test_m_step_waits_for_its_delay():
     after = jax.tree.map(jnp.add, trained, steps)
     moved.append({k for k in trained if np.any(after[k] != trained[k])})
   assert moved == [set(trained) - {"bp"}] * 2 + [set(trained)]
+
+
+def test_learning_rates_decay_along_a_cosine_to_a_tenth():
+  config = dataclasses.replace(CONFIG, decay_updates=4)
+  optimizer = make_optimizer(config, ("encoder", "bp", "alpha"))
+  trained = dict.fromkeys(("encoder", "bp", "alpha", "nu"), jnp.ones(3))
+  opt_state, taken = optimizer.init(trained), []
+  for _ in range(6):
+    # With a constant gradient, Adam moves by the learning rate.
+    updates, opt_state = optimizer.update(trained, opt_state, trained)
+    steps: Any = updates
+    taken.append([-float(steps[k][0]) for k in ("encoder", "bp", "alpha")])
+  cosine = 0.5 + 0.5 * np.cos(np.pi * np.minimum(np.arange(6), 4) / 4)
+  share = 0.1 + 0.9 * cosine
+  rates = config.learning_rate_e, config.learning_rate_m
+  np.testing.assert_allclose(np.array(taken)[:, :2], np.outer(share, rates), rtol=1e-4)
+  np.testing.assert_allclose(
+    np.array(taken)[:, 2], config.learning_rate_alpha, rtol=1e-4
+  )
 
 
 def test_transitions_of_weight_zero_change_nothing(state, update):

@@ -83,6 +83,7 @@ def dicts(tree: Any) -> Iterator[dict[str, Any]]:
     ("ray_layouts", []),
     ("learner", []),
     ("learner", ["--lstm-instants", "2", "--phi", "once"]),
+    ("timeline", []),
     ("encoder_layouts", []),
     ("env_steps", []),
     ("env_steps", ["--obs", "state"]),
