@@ -23,10 +23,6 @@ from apnpql_jax.atomic import check_writable
 from apnpql_jax.console import print_line
 from apnpql_jax.errors import UserError
 
-MIN_THREADS = 4  # XLA:CPU threads per emulated device, which share a pool
-# Operations that XLA:CPU runs in the library YNNPACK; its default adds "REDUCE".
-KEPT_FUSIONS = "INDIVIDUAL_CONVOLUTION", "INDIVIDUAL_DOT"
-# The flag and the jaxlib versions that have it; XLA aborts on unknown flags.
 _UNSUPPORTED = {
   "jax_enable_x64": ("1", "true", "t", "yes", "y", "on"),
   "jax_numpy_rank_promotion": ("raise",),
@@ -34,6 +30,10 @@ _UNSUPPORTED = {
 }
 """Settings of JAX and their values under which this package or MJX fails."""
 
+MIN_THREADS = 4  # XLA:CPU threads per emulated device, which share a pool
+# Operations that XLA:CPU runs in the library YNNPACK; its default adds "REDUCE".
+KEPT_FUSIONS = "INDIVIDUAL_CONVOLUTION", "INDIVIDUAL_DOT"
+# The flag and the jaxlib versions that have it; XLA aborts on unknown flags.
 _JAX_DEFAULTS = None, 1.0  # of the settings below
 _FLAG, _FLAG_VERSIONS = "xla_cpu_experimental_ynn_fusion_type", r"0\.1[01]\."
 

@@ -182,6 +182,21 @@ def test_settings_that_come_too_late_are_an_error(also):
     assert output.endswith("call configure() first\n")
 
 
+@pytest.mark.parametrize(
+  ("name", "value"),
+  [
+    ("jax_enable_x64", True),
+    ("jax_numpy_rank_promotion", "raise"),
+    ("jax_numpy_dtype_promotion", "strict"),
+  ],
+)
+def test_unsupported_settings_of_jax_are_refused(name, value):
+  refused = f"try: {CONFIGURE}\nexcept apnpql_jax.UserError as error: print(error)"
+  line = f"{name.upper()}={value} is not supported; unset it\n"
+  assert run(refused, **{name.upper(): str(value)}) == line
+  assert run(f"import jax; jax.config.update({name!r}, {value!r})\n{refused}") == line
+
+
 def test_quiet_warp_drops_only_its_two_lines(capsys):
   with runtime.quiet_warp():
     print("Failed to import warp: No module named 'warp'")

@@ -48,8 +48,10 @@ class _WandbSink:
     import wandb
 
     path = run_dir / "wandb_id"
-    drawn = read_text(path, 100) if path.exists() else uuid.uuid4().hex[:8]
-    write_text(path, identity := config["wandb_id"] or drawn)
+    identity = config["wandb_id"]
+    if not identity:
+      identity = read_text(path, 100) if path.exists() else uuid.uuid4().hex[:8]
+    write_text(path, identity)
     self._run = wandb.init(
       project=config["wandb_project"],
       entity=config["wandb_entity"] or None,
