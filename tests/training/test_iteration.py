@@ -176,7 +176,9 @@ def test_another_seed_is_another_run(built):
 def _save(run: Path, built: Built, *states: tuple[TrainState, bool]) -> None:
   with CheckpointWriter(run, built.config, keep=9) as writer:
     for state, whole in states:
-      writer.save(int(state.env_steps), resume.to_items(state, whole=whole))
+      rings = resume.to_rings(state, chunk=LENGTH) if whole else {}
+      items = resume.to_items(state, whole=whole)
+      writer.save(int(state.env_steps), items, rings=rings)
 
 
 def test_a_saved_state_continues_bit_for_bit(built, iteration, tmp_path):
