@@ -109,11 +109,12 @@ class CheckpointWriter:
     self._saving = step, time.monotonic()
     self._segments.begin(self._rings)
     apart = {path for ring in self._rings.values() for path in ring.arrays}
-    described, copies = {}, {}
+    described, whole = {}, {}
     for name, tree in items.items():
       paths = {path.removeprefix(f"{name}/") for path in apart}
       described[name] = checkpoint_record.describe_item(tree, paths)
-      copies[name] = jax.tree.map(jnp.copy, leaves.without(tree, paths))
+      whole[name] = leaves.without(tree, paths)
+    copies = _copy(whole)
     self._policy.rates[step], self._policy.items[step] = success_rate, set(items)
 
     def commit() -> None:
@@ -202,8 +203,8 @@ class CheckpointWriter:
 
   def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
     if kind is None or not issubclass(kind, SaveError):
-      if kind is not None:
-        self._commit = None  # The rings may be gone.
+      if kind is not None and self._commit:  # The rings may be gone.
+        self._saving = self._commit = None
       self.close()
 
   def _failed(self, error: Exception) -> SaveError:
@@ -217,6 +218,11 @@ class CheckpointWriter:
     if "os_error_code" in str(error):  # Leave out the names of temporary files.
       cause = " ".join(str(error).split()).rpartition(": ")[2]
     return SaveError(f"checkpoint {step} could not be saved: {cause}")
+
+
+@jax.jit
+def _copy(tree: Any) -> Any:
+  return jax.tree.map(jnp.copy, tree)
 
 
 class _KeepNewestAndBest:

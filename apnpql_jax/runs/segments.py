@@ -23,7 +23,7 @@ import numpy as np
 from apnpql_jax import devices
 from apnpql_jax.runs import leaves
 
-PART_BYTES = 128 << 20
+PART_BYTES: int = 128 << 20
 """Size of a part over all devices; the copy of one is in memory at a time."""
 
 _CHUNK_BYTES = 16 << 20
@@ -81,8 +81,9 @@ class SegmentWriter:
     self._folder = folder(run_dir)
     self._held = {segment[:3]: segment for segment in held}
     self._added = {name: ring.added for name, ring in rings.items()}
-    names = self._folder.glob("*") if devices.is_primary() else ()
-    last = max((int(path.name) for path in names), default=0)
+    names = [path.name for path in self._folder.glob("*")]
+    last = max((int(name) for name in names if name.isdigit()), default=0)
+    # Other processes may see another listing of a shared file system.
     self._last = int(multihost_utils.broadcast_one_to_all(np.int32(last)))
     self._parts: list[_Part] = []
     self._saver = ocp.StandardCheckpointer()
