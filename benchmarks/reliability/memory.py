@@ -24,7 +24,6 @@ import time
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from apnpql_jax import testing
 from apnpql_jax.agents.learner import make_agent
@@ -84,7 +83,7 @@ def prepare(run: Path, config: TrainConfig) -> dict[str, Any]:
   for _ in range(config.replay.capacity // config.replay.expert_steps):
     ring = add(ring, chunk)
   steps = config.replay.capacity
-  state = state.replace(replay=ring, env_steps=jnp.int32(steps))
+  state = state.replace(replay=ring, env_steps=state.env_steps + steps)
   run_folder.create(run, config)
   with CheckpointWriter(run, config, keep=1) as writer:
     rings = resume.to_rings(state, chunk=config.rollout_length)

@@ -10,8 +10,6 @@ import subprocess
 import sys
 import tempfile
 
-import jax.numpy as jnp
-
 from apnpql_jax import devices, testing
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.envs.env import make_env
@@ -41,7 +39,7 @@ def test_a_save_takes_the_memory_of_a_part_and_gives_it_back():
   print({name: x >> 20 for name, x in found.items()})
   replay = found["replay"]
   assert replay > 10 * PART_BYTES
-  assert found["saving"] - found["before"] < 4 * PART_BYTES
+  assert found["saving"] - found["before"] < 5 * PART_BYTES
   assert found["saved"] - found["before"] < 2 * PART_BYTES
   assert found["restoring"] - found["dropped"] < replay + 5 * PART_BYTES
   assert found["restored"] - found["dropped"] < replay + 2 * PART_BYTES
@@ -59,7 +57,9 @@ def save_and_restore() -> None:
   state = initial_state(config, env, agent, collect_expert)
   iteration = make_iteration(config, env, agent)
   # As if the replay were full, so that all of it has to be written.
-  state, _ = iteration(state.replace(env_steps=jnp.int32(CAPACITY)))
+  state = state.replace(env_steps=state.env_steps + CAPACITY)
+  for _ in range(2):
+    state, _ = iteration(state)
   found = {"replay": leaves.nbytes(example.replay), "needed": needed_memory(example)}
   with tempfile.TemporaryDirectory() as name:
     run = Path(name)
@@ -72,12 +72,12 @@ def save_and_restore() -> None:
         state, _ = iteration(state)
     found["saving"], _ = memory(os.getpid())
     found["saved"] = settled()
-    del state
+    del state, writer
     found["dropped"] = settled()
     restored = resume.restore(config, run, example, print)
     found["restoring"], _ = memory(os.getpid())
     found["restored"] = settled()
-    assert int(restored.env_steps) == CAPACITY + testing.STEPS
+    assert int(restored.env_steps) == CAPACITY + 2 * testing.STEPS
   print(json.dumps(found))
 
 
