@@ -17,7 +17,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from apnpql_jax.config.schema import AgentConfig, EnvConfig, ReplayConfig, TrainConfig
-from apnpql_jax.runs import metrics
+from apnpql_jax.runs import checkpoint_record, metrics, segments
 from apnpql_jax.types import Observation, Slot, TimeStep, Transition
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -88,13 +88,20 @@ def rows(run_dir: Path) -> list[dict[str, Any]]:
 
 
 def saved_arrays(run_dir: Path, step: int) -> dict[str, np.ndarray]:
-  """Returns every array of a checkpoint, read by Orbax alone."""
+  """Returns every array of a checkpoint, read by Orbax alone.
+
+  Arrays in segments are in parts.
+  """
+  folder = (run_dir / "checkpoints" / str(step)).absolute()
+  folders = {item: folder / item for item in ("learner", "rest", "replay")}
+  for part in checkpoint_record.read(run_dir, step).segments:
+    folders[f"{part.ring} {part.start}"] = segments.folder(run_dir) / str(part.number)
   found = {}
-  for item in ("learner", "rest", "replay"):
+  for name, folder in folders.items():
     with ocp.StandardCheckpointer() as reader:
-      tree = reader.restore((run_dir / "checkpoints" / str(step) / item).absolute())
+      tree = reader.restore(folder)
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-      found[f"{item} {path}"] = np.asarray(leaf)
+      found[f"{name} {path}"] = np.asarray(leaf)
   return found
 
 

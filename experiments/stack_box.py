@@ -17,7 +17,7 @@ CONFIG = dataclasses.replace(
   env=dataclasses.replace(_PUSH.env, task="stack_box", worlds=64, bank_rows=8_192),
   agent=dataclasses.replace(_PUSH.agent, min_prob=0.02),
   replay=dataclasses.replace(_PUSH.replay, capacity=51_200, expert_steps=51_200),
-  total_steps=122_880,
+  total_steps=81_920,
   eval_every=20_480,
   checkpoint_every=20_480,
 )

@@ -65,6 +65,11 @@ _BOUNDS = {
 _MAX_SIDE = 1024  # pixels
 _PARTS = "env.", "agent."  # checked on their own
 
+PROCESS_BYTES = 9 << 28
+"""Memory that a training takes besides its state, with the presets' networks on a CPU:
+2 GiB for the libraries and for a first compilation, which frees 1.3 of them, and 256
+MiB for a checkpoint. `benchmarks.reliability.memory` measures it."""
+
 _OTHER_BYTES = 4 * (21 + 3 + 7 + 21 + 2) + 2
 """Bytes of a slot without images: robot state, tool, action, primitive labels, reward
 and log density of the action (f32), and the two end flags."""
@@ -250,9 +255,9 @@ def _check_replay(config: TrainConfig, memory_bytes: int | None) -> None:
         f"replay.{name}={slots} holds no {config.agent.n_step}-step transition; use at "
         f"least {fewest * config.env.worlds}"
       )
-  need = replay_bytes(config)
+  need = replay_bytes(config) + PROCESS_BYTES
   if memory_bytes is not None and need > memory_bytes:
     raise ConfigError(
-      f"the replays need {need / 2**30:.1f} GiB but the devices have "
+      f"training with these replays needs {need / 2**30:.1f} GiB but the devices have "
       f"{memory_bytes / 2**30:.1f} GiB; lower replay.capacity or replay.expert_steps"
     )

@@ -6,18 +6,21 @@ alone. Each is verified against the record of the checkpoint, see ``checkpoint_r
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import json
 import logging
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
+
 from apnpql_jax.config.files import config_from_json
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import FileError, UserError, one_line
-from apnpql_jax.runs import checkpoint_record, leaves
+from apnpql_jax.runs import checkpoint_record, leaves, segments
 from apnpql_jax.runs.checkpoint_record import DamagedError, best, newest_until, title
 from apnpql_jax.runs.run_folder import fixed_diff
+from apnpql_jax.runs.segments import Segment
 
 all_steps = checkpoint_record.steps
 
@@ -123,19 +126,64 @@ def _step_with(run_dir: Path, last: int, item: str) -> int:
 
 
 def _restore_item(run_dir: Path, step: int, item: str, example: Any) -> Any:
-  import orbax.checkpoint as ocp
-
   name = title(run_dir, step)
-  saved = checkpoint_record.read(run_dir, step).items[item]
+  record = checkpoint_record.read(run_dir, step)
+  saved = record.items[item]
   wanted = {path: leaves.kind(leaf) for path, leaf in leaves.named(example).items()}
   for path in sorted(saved.keys() | wanted.keys()):
     held = saved[path].kind if path in saved else "nothing"
     expected = wanted.get(path, "nothing")
     if held != expected:
       raise FileError(f"{name} holds {held} at {path}, where {expected} is expected")
+  apart = {path for path, leaf in saved.items() if leaf.crc32 is None}
+  folder = checkpoint_record.folder(run_dir) / str(step) / item
+  crc32s = {path: leaf.crc32 for path, leaf in saved.items()}
+  tree = _read(folder, leaves.without(example, apart), crc32s, name)
+  impls = {path: leaf.key_impl for path, leaf in saved.items() if leaf.key_impl}
+  try:
+    tree = leaves.to_typed(tree, impls, example)  # With zeros for arrays apart.
+  except (TypeError, ValueError) as error:
+    raise DamagedError(f"{name} cannot be read: {one_line(error)}") from None
+  arrays = leaves.named(tree)
+  rings = {f"{item}/{path}": arrays.pop(path) for path in apart}
+  del tree  # The rings are donated.
+  rings = _fill(run_dir, rings, record.segments, name)
+  arrays |= {path: rings[f"{item}/{path}"] for path in apart}
+  return leaves.fill(example, arrays)
+
+
+def _fill(
+  run_dir: Path, rings: dict[str, Any], held: Sequence[Segment], name: str
+) -> dict[str, Any]:
+  """Returns the rings with their segments written into them, in place."""
+  found = set()
+  for segment in held:
+    paths = segment.crc32s.keys()
+    if not paths & rings.keys():
+      continue
+    rows = segment.stop - segment.start
+    if not paths <= rings.keys() or segment.stop > min(len(rings[x]) for x in paths):
+      raise DamagedError(f"{name} cannot be read: a segment is not within its ring")
+    target = {path: rings.pop(path) for path in paths}
+    shapes = {
+      path: jax.ShapeDtypeStruct((rows, *x.shape[1:]), x.dtype, sharding=x.sharding)
+      for path, x in target.items()
+    }
+    folder = segments.folder(run_dir) / str(segment.number)
+    part = _read(folder, segments.to_tree(shapes), segment.crc32s, name)
+    rings |= segments.put(target, leaves.named(part), segment.start)
+    found |= paths
+  if missing := rings.keys() - found:
+    raise DamagedError(f"{name} cannot be read: no segment holds {min(missing)}")
+  return rings
+
+
+def _read(folder: Path, example: Any, crc32s: Mapping[str, int | None], name: str):
+  """Returns a tree of arrays without typed keys, compared with its checksums."""
+  import orbax.checkpoint as ocp
+
   try:
     with ocp.StandardCheckpointer() as reader:
-      folder = checkpoint_record.folder(run_dir) / str(step) / item
       tree = reader.restore(folder, leaves.abstract(example))
   except (MemoryError, PermissionError):
     raise  # Not caused by the checkpoint.
@@ -144,10 +192,6 @@ def _restore_item(run_dir: Path, step: int, item: str, example: Any) -> Any:
     logging.getLogger("asyncio").setLevel(logging.CRITICAL)
     raise DamagedError(f"{name} cannot be read: {one_line(error)}") from error
   for path, crc32 in leaves.checksums(tree).items():
-    if crc32 != saved[path].crc32:
+    if crc32 != crc32s[path]:
       raise DamagedError(f"{name} is damaged: {path} is not what was saved")
-  impls = {path: leaf.key_impl for path, leaf in saved.items() if leaf.key_impl}
-  try:
-    return leaves.to_typed(tree, impls, example)
-  except (TypeError, ValueError) as error:
-    raise DamagedError(f"{name} cannot be read: {one_line(error)}") from None
+  return tree

@@ -7,8 +7,10 @@ itself, because Orbax silently casts a leaf of another dtype and misses flipped 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping, Sequence
+import contextlib
 import json
+import operator
 from pathlib import Path
 from typing import Any, NamedTuple
 import zlib
@@ -17,9 +19,14 @@ from apnpql_jax.config.files import config_to_json
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import FileError, UserError, one_line
 from apnpql_jax.runs import leaves, text
+from apnpql_jax.runs.segments import Segment
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 """Version of the format; incremented whenever the format changes."""
+
+_READABLE = (2, SCHEMA_VERSION)  # Version 2 has no segments.
+
+_FILE = "meta/metadata"  # in the folder of a checkpoint
 
 _MAX_BYTES = 16 << 20
 """Limit for the file of a record, which takes a few hundred bytes per leaf."""
@@ -38,7 +45,7 @@ class Leaf(NamedTuple):
 
   kind: str  # dtype and shape, see ``leaves.kind``
   key_impl: str | None  # generator of a typed PRNG key, see ``leaves.key_impl``
-  crc32: int  # of the bytes
+  crc32: int | None  # of the bytes; None if the array is in segments
 
 
 class Record(NamedTuple):
@@ -47,19 +54,34 @@ class Record(NamedTuple):
   config: dict[str, Any]
   success_rate: float | None
   items: dict[str, dict[str, Leaf]]  # item -> path -> leaf; some items may be absent
+  segments: list[Segment]
 
 
 def describe(
-  config: TrainConfig, items: Mapping[str, Any], success_rate: float | None
+  config: TrainConfig,
+  items: Mapping[str, Mapping[str, Leaf]],
+  success_rate: float | None,
+  segments: Sequence[Segment],
 ) -> dict[str, Any]:
-  """Returns the record for a checkpoint of ``items`` (name -> pytree) as JSON data."""
+  """Returns the record for a checkpoint as JSON data; see ``Record``."""
   record = {
     "schema_version": SCHEMA_VERSION,
     "config": json.loads(config_to_json(config)),
     "success_rate": None if success_rate is None else float(success_rate),
-    "items": {name: _describe_leaves(tree) for name, tree in items.items()},
+    "items": items,
+    "segments": sorted(segments),
   }
   return record | {"crc32": _checksum(record)}
+
+
+def describe_item(tree: Any, apart: Container[str]) -> dict[str, Leaf]:
+  """Returns path -> leaf; those at the paths ``apart`` are in segments."""
+  named = leaves.named(tree)
+  crc32s = leaves.checksums(leaves.without(tree, apart))
+  return {
+    path: Leaf(leaves.kind(leaf), leaves.key_impl(leaf), crc32s.get(path))
+    for path, leaf in named.items()
+  }
 
 
 def read(run_dir: Path, step: int) -> Record:
@@ -69,15 +91,29 @@ def read(run_dir: Path, step: int) -> Record:
     DamagedError: The record is missing or differs from what was written.
     FileError: The record has another format.
   """
-  path = folder(run_dir) / str(step) / "meta" / "metadata"
-  name = title(run_dir, step)
+  return _read(folder(run_dir) / str(step) / _FILE, title(run_dir, step))
+
+
+def used_segments(run_dir: Path) -> set[int]:
+  """Returns the numbers of the segments of all readable checkpoints.
+
+  They include those that are being written or were set aside.
+  """
+  used = set()
+  for path in run_dir.glob(f"*/*/{_FILE}"):
+    with contextlib.suppress(UserError):
+      used |= {segment.number for segment in _read(path, str(path)).segments}
+  return used
+
+
+def _read(path: Path, name: str) -> Record:
   try:
     record = json.loads(text.read_text(path, _MAX_BYTES))
     version, crc32 = record["schema_version"], record.pop("crc32", None)
     whole = crc32 == _checksum(record)
-    if version != SCHEMA_VERSION and (whole or crc32 is None):
+    if version not in _READABLE and (whole or crc32 is None):
       raise FileError(
-        f"{name} has format {str(version)[:20]}; this code reads {SCHEMA_VERSION}"
+        f"{name} has format {str(version)[:20]}; this code reads up to {SCHEMA_VERSION}"
       )
     if not whole:
       raise DamagedError(f"{name} is damaged: its record is not what was saved")
@@ -86,7 +122,12 @@ def read(run_dir: Path, step: int) -> Record:
       for item, tree in record["items"].items()
     }
     rate = record["success_rate"]
-    return Record(record["config"], None if rate is None else float(rate), items)
+    return Record(
+      config=record["config"],
+      success_rate=None if rate is None else float(rate),
+      items=items,
+      segments=[_segment(*fields) for fields in record.get("segments", ())],
+    )
   except UserError:
     raise
   except _MALFORMED as error:
@@ -132,12 +173,14 @@ def newest_until(last: int, steps: Iterable[int]) -> int | None:
   return max((step for step in steps if step <= last), default=None)
 
 
-def _describe_leaves(tree: Any) -> dict[str, Leaf]:
-  crc32s = leaves.checksums(tree)
-  return {
-    path: Leaf(leaves.kind(leaf), leaves.key_impl(leaf), crc32s[path])
-    for path, leaf in leaves.named(tree).items()
-  }
+def _segment(
+  ring: str, start: int, stop: int, number: int, crc32s: dict[str, int]
+) -> Segment:
+  """Returns a segment whose indices and number are what they claim to be."""
+  start, stop, number = map(operator.index, (start, stop, number))
+  if not 0 <= start < stop:
+    raise ValueError(f"a segment is from {start} to {stop}")
+  return Segment(str(ring), start, stop, number, dict(crc32s))
 
 
 def _checksum(record: dict[str, Any]) -> int:

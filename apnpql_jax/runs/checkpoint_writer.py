@@ -1,24 +1,26 @@
 """Checkpoint writing in the background, with Orbax.
 
 A checkpoint consists of named items, so that the replay, by far the largest, can be
-saved less often than the rest.
+saved less often than the rest. Its rings are in segments, see ``segments``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 import shutil
 import time
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+
+from apnpql_jax import devices
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import one_line
-from apnpql_jax.runs import checkpoint_record, leaves
+from apnpql_jax.runs import checkpoint_record, leaves, segments
 from apnpql_jax.runs.checkpoint_record import best, newest_until
-
-_CHUNK_BYTES = 16 << 20
-"""Unit of compression; a replay in one chunk keeps a core busy twice as long."""
+from apnpql_jax.runs.segments import Ring, SegmentWriter
 
 
 class SaveError(OSError):
@@ -32,15 +34,34 @@ class CheckpointWriter:
   save has failed. A checkpoint becomes visible only once it is complete.
   """
 
-  def __init__(self, run_dir: Path, config: TrainConfig, *, keep: int):
-    """Opens the run for writing; ``config`` is stored with every checkpoint.
+  def __init__(
+    self,
+    run_dir: Path,
+    config: TrainConfig,
+    *,
+    keep: int,
+    restored: Mapping[str, Ring] | None = None,
+  ):
+    """Opens the run for writing.
 
     Keeps the ``keep`` newest checkpoints, the older ones that hold items they lack, and
     the one with the highest success rate.
+
+    Args:
+      run_dir: The run folder.
+      config: Settings of the run, stored with every checkpoint.
+      keep: Number of newest checkpoints to keep.
+      restored: The rings, if the newest checkpoints have what is in them.
     """
     import orbax.checkpoint as ocp
 
     self._run_dir, self._config = run_dir, config
+    self._delete_unused()
+    devices.barrier()
+    records = checkpoint_record.read_all(run_dir).values() if restored else ()
+    held = [segment for record in records for segment in record.segments]
+    self._rings: Mapping[str, Ring] = restored or {}
+    self._segments = SegmentWriter(run_dir, self._rings, held)
     self._policy = _KeepNewestAndBest(run_dir, keep)
     options = ocp.CheckpointManagerOptions(
       preservation_policy=self._policy, cleanup_tmp_directories=True
@@ -49,6 +70,8 @@ class CheckpointWriter:
       checkpoint_record.folder(run_dir), options=options
     )
     self._saving: tuple[int, float] | None = None
+    self._commit: Callable[[], None] | None = None
+    """Starts writing the checkpoint once its segments are on disk."""
 
   @property
   def empty(self) -> bool:
@@ -56,58 +79,94 @@ class CheckpointWriter:
     return not self._manager.all_steps()
 
   def save(
-    self, step: int, items: Mapping[str, Any], *, success_rate: float | None = None
+    self,
+    step: int,
+    items: Mapping[str, Any],
+    *,
+    rings: Mapping[str, Ring] | None = None,
+    success_rate: float | None = None,
   ) -> None:
     """Starts writing ``items``; they may be donated as soon as this returns.
 
     Waits for the previous save first. Does nothing if this step has already been saved.
-    On a CPU, JAX replaces donated buffers that are still being read, which takes memory
-    for a second state.
 
     Args:
       step: Environment steps done.
       items: Name -> pytree of arrays, including typed PRNG keys.
+      rings: Name -> arrays of the items that are written in segments. ``proceed`` must
+        be called whenever they have changed.
       success_rate: Decides which checkpoint is the best; None if not evaluated.
 
     Raises:
       SaveError: This save cannot be started, or the previous one failed.
     """
-    import jax
     import orbax.checkpoint as ocp
 
     self.wait()
     if step in self._manager.all_steps():
       return
+    self._rings = rings or {}
     self._saving = step, time.monotonic()
-    record = checkpoint_record.describe(self._config, items, success_rate)
-    parts: dict[str, Any] = {"meta": ocp.args.JsonSave(record)}
-    chunked = ocp.SaveArgs(chunk_byte_size=_CHUNK_BYTES)
+    self._segments.begin(self._rings)
+    apart = {path for ring in self._rings.values() for path in ring.arrays}
+    described, whole = {}, {}
     for name, tree in items.items():
-      plain = leaves.to_plain(tree)
-      args = jax.tree.map(lambda _: chunked, plain)
-      parts[name] = ocp.args.StandardSave(plain, save_args=args)
+      paths = {path.removeprefix(f"{name}/") for path in apart}
+      described[name] = checkpoint_record.describe_item(tree, paths)
+      whole[name] = leaves.without(tree, paths)
+    copies = _copy(whole)
     self._policy.rates[step], self._policy.items[step] = success_rate, set(items)
-    try:
+
+    def commit() -> None:
+      written = self._segments.segments
+      record = checkpoint_record.describe(
+        self._config, described, success_rate, written
+      )
+      parts: dict[str, Any] = {"meta": ocp.args.JsonSave(record)}
+      for name, tree in copies.items():
+        plain = leaves.to_plain(tree)
+        args = segments.chunked(plain)
+        parts[name] = ocp.args.StandardSave(plain, save_args=args)
       self._manager.save(step, args=ocp.args.Composite(**parts), force=True)
-    except Exception as error:
-      raise self._failed(error) from error
 
-  def finished(self, *, wait: bool = False) -> dict[str, float]:
-    """Returns seconds and MiB of a save that ended since the last call, or nothing.
+    self._commit = commit
+    self._proceed(wait=False)
 
-    With ``wait``, waits for a save in progress.
+  def proceed(
+    self, rings: Mapping[str, Ring] | None = None, *, wait: bool = False
+  ) -> dict[str, float]:
+    """Continues a save, and returns seconds and MiB of one that has ended, if any.
+
+    Args:
+      rings: The rings as they are now; None if they have not changed.
+      wait: Wait for a save in progress.
 
     Raises:
       SaveError: The save failed.
     """
-    if self._saving is None or not wait and self._manager.is_saving_in_progress():
+    if self._saving is None:
+      return {}
+    self._rings = self._rings if rings is None else rings
+    self._proceed(wait=wait)
+    if self._commit or not wait and self._manager.is_saving_in_progress():
       return {}
     step, began = self._saving
     self.wait()
-    files = (checkpoint_record.folder(self._run_dir) / str(step)).rglob("*")
+    folders = [checkpoint_record.folder(self._run_dir) / str(step)]
+    folders += self._segments.written
+    files = [path for folder in folders for path in folder.rglob("*")]
     size = sum(path.stat().st_size for path in files if path.is_file())
     seconds = time.monotonic() - began
     return {"checkpoint/wall_s": seconds, "checkpoint/mib": size / 2**20}
+
+  def _proceed(self, *, wait: bool) -> None:
+    """Writes segments and, once all are on disk, starts writing the checkpoint."""
+    try:
+      if self._commit and self._segments.proceed(self._rings, wait=wait):
+        commit, self._commit = self._commit, None
+        commit()
+    except Exception as error:
+      raise self._failed(error) from error
 
   def wait(self) -> None:
     """Waits until everything saved is on disk.
@@ -115,11 +174,19 @@ class CheckpointWriter:
     Raises:
       SaveError: A save failed.
     """
+    self._proceed(wait=True)
     try:
       self._manager.wait_until_finished()
     except Exception as error:
       raise self._failed(error) from error
-    self._saving = None
+    if self._saving:
+      self._saving = None
+      self._delete_unused()
+
+  def _delete_unused(self) -> None:
+    if devices.is_primary():
+      used = checkpoint_record.used_segments(self._run_dir)
+      segments.delete_unused(self._run_dir, used)
 
   def close(self) -> None:
     """Waits as ``wait`` does, then releases Orbax's threads.
@@ -128,6 +195,7 @@ class CheckpointWriter:
     minutes.
     """
     self.wait()
+    self._segments.close()
     self._manager.close()
 
   def __enter__(self) -> CheckpointWriter:
@@ -135,18 +203,26 @@ class CheckpointWriter:
 
   def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
     if kind is None or not issubclass(kind, SaveError):
+      if kind is not None and self._commit:  # The rings may be gone.
+        self._saving = self._commit = None
       self.close()
 
   def _failed(self, error: Exception) -> SaveError:
     """Removes what a failed save left behind, which may fill the disk."""
     step, _ = self._saving or (None, 0.0)
-    self._saving = None
+    self._saving = self._commit = None
     for part in checkpoint_record.folder(self._run_dir).glob(f"{step}.*-tmp*"):
       shutil.rmtree(part, ignore_errors=True)
+    self._delete_unused()
     cause = one_line(error)
     if "os_error_code" in str(error):  # Leave out the names of temporary files.
       cause = " ".join(str(error).split()).rpartition(": ")[2]
     return SaveError(f"checkpoint {step} could not be saved: {cause}")
+
+
+@jax.jit
+def _copy(tree: Any) -> Any:
+  return jax.tree.map(jnp.copy, tree)
 
 
 class _KeepNewestAndBest:

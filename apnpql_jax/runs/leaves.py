@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 import math
 from typing import Any
 import zlib
@@ -31,6 +31,13 @@ def fill(example: Any, arrays: Mapping[str, Any]) -> Any:
     KeyError: An array is missing.
   """
   return jax.tree_util.tree_map_with_path(lambda p, _: arrays[_name(p)], example)
+
+
+def without(tree: Any, paths: Container[str]) -> Any:
+  """Returns the tree with None in place of the leaves at ``paths``."""
+  return jax.tree_util.tree_map_with_path(
+    lambda path, leaf: None if _name(path) in paths else leaf, tree
+  )
 
 
 def nbytes(tree: Any) -> int:

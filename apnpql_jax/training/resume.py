@@ -15,7 +15,9 @@ import jax.numpy as jnp
 
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.data import replay
-from apnpql_jax.runs import checkpoint_reader, checkpoint_record, metrics
+from apnpql_jax.data.replay import Replay
+from apnpql_jax.runs import checkpoint_reader, checkpoint_record, leaves, metrics
+from apnpql_jax.runs.segments import Ring
 from apnpql_jax.training.state import TrainState
 
 
@@ -26,6 +28,28 @@ def to_items(state: TrainState, *, whole: bool) -> dict[str, Any]:
   if whole:
     items["replay"] = {"agent": state.replay, "expert": state.expert_replay}
   return items
+
+
+def to_rings(state: TrainState, *, chunk: int) -> dict[str, Ring]:
+  """Returns the arrays of the item "replay" that are written in segments.
+
+  ``chunk`` is the length of a rollout. Truncation marks are left out, because
+  ``replay.exclude`` sets them later.
+  """
+  worlds = state.replay.slots.action.shape[1]
+  added = int(state.env_steps) // worlds
+  rings = {"agent": _ring(state.replay, "agent", added, chunk)}
+  if state.expert_replay is not None:
+    length = len(state.expert_replay.slots.action)
+    rings["expert"] = _ring(state.expert_replay, "expert", length, 0)
+  return rings
+
+
+def _ring(ring: Replay, name: str, added: int, chunk: int) -> Ring:
+  named = leaves.named({"replay": {name: {"slots": ring.slots}}})
+  marks = f"replay/{name}/slots/timestep/truncated"
+  arrays = {path: x for path, x in named.items() if x.size and path != marks}
+  return Ring(arrays, int(ring.cursor), added, chunk)
 
 
 def restore(

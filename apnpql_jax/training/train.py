@@ -12,12 +12,14 @@ import signal
 import threading
 from typing import Any, NamedTuple
 
+import jax
 from jax.sharding import Mesh
 
 from apnpql_jax import devices, errors
 from apnpql_jax.agents import table_one
 from apnpql_jax.agents.learner import Agent, make_agent
 from apnpql_jax.config import codec
+from apnpql_jax.config.checks import PROCESS_BYTES
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.console import print_line
 from apnpql_jax.data import demonstrations, replay
@@ -40,7 +42,7 @@ from apnpql_jax.training import expert, skipped_updates
 from apnpql_jax.training.expert import ExpertReplayMaker, collect_expert
 from apnpql_jax.training.iteration import Iteration, compile_iteration
 from apnpql_jax.training.reporter import Reporter
-from apnpql_jax.training.resume import restore, set_aside, to_items
+from apnpql_jax.training.resume import restore, set_aside, to_items, to_rings
 from apnpql_jax.training.state import TrainState, example_state, initial_state
 
 
@@ -160,12 +162,17 @@ def _run(
       progress = stack.enter_context(TrainProgress(config.total_steps))
       env = start.env.on_one_device()
       reporter = Reporter(config, env, start.agent, path, writer, progress)
-    saver = CheckpointWriter(path, config, keep=config.keep_checkpoints)
+    rings = to_rings(start.state, chunk=config.rollout_length)
+    saver = CheckpointWriter(
+      path, config, keep=config.keep_checkpoints, restored=rings if resume_step else {}
+    )
     stack.enter_context(saver)
+    del rings
     iteration = start.iteration.result()
+    devices.release_memory()
     devices.barrier()
     state = _loop(config, start, iteration, reporter, saver, signals)
-    figures = saver.finished(wait=True)
+    figures = saver.proceed(wait=True)
     if reporter and figures:
       reporter.writer.write(int(state.env_steps), figures)
   return state, reporter.evaluation if reporter else {}
@@ -192,11 +199,11 @@ def _start(
   agent = make_agent(config.agent)  # Before the worlds, which can take minutes.
   env = make_env(config.env, mesh, instants=config.agent.lstm_instants)
   example = example_state(config, env, agent)
-  size = leaves.nbytes(example)
-  devices.check_memory(size, "the training state")
+  devices.check_memory(needed_memory(example), "the training")
   # The newest ones, the best one, and the one being written. A resumed run has most.
   kept = 1 if saved else config.keep_checkpoints + 2
-  if warning := run_folder.check_disk(run_dir, count * size, kept=kept):
+  size = count * leaves.nbytes(example)
+  if warning := run_folder.check_disk(run_dir, size, kept=kept):
     _print_line(warning)
   # Compile while the state is being made or read, which also compiles: XLA keeps a
   # second core busy that way.
@@ -208,6 +215,7 @@ def _start(
     return Start(env, agent, iteration, path, state, int(state.env_steps))
   _print_line("filling the expert replay")
   state = initial_state(config, env, agent, fill)
+  devices.release_memory()
   if state.expert_replay is not None:
     solved, ended = map(int, replay.episodes(state.expert_replay))
     _print_line(f"expert replay: {solved} of {ended} episodes solved")
@@ -219,6 +227,11 @@ def _start(
   )
   path = run_folder.open_run(run_dir).path
   return Start(env, agent, iteration, path, state, None)
+
+
+def needed_memory(example: TrainState) -> int:
+  """Returns the bytes that a training takes on each device, checkpoints included."""
+  return leaves.nbytes(example) + PROCESS_BYTES // jax.local_device_count()
 
 
 def _expert(config: TrainConfig) -> ExpertReplayMaker:
@@ -243,7 +256,8 @@ def _loop(config, start, iteration, reporter, saver, signals) -> TrainState:
     step = int(state.env_steps)
     # Before the report: from then on there is something to save.
     signals.finish_first(f"stopped at once; to continue: --resume {start.path}")
-    metrics |= saver.finished()
+    rings = to_rings(state, chunk=config.rollout_length)
+    metrics |= saver.proceed(rings)
     if reporter:
       reporter.iteration(step, int(state.learner.step), metrics)
     skipped_updates.check(config, state, start.path)
@@ -258,7 +272,9 @@ def _loop(config, start, iteration, reporter, saver, signals) -> TrainState:
     whole = _passed(before, step, config.save_replay_every or config.checkpoint_every)
     if last or whole or _passed(before, step, config.checkpoint_every):
       items = to_items(state, whole=last or whole or saver.empty)
-      saver.save(step, items, success_rate=rate)
+      rings = rings if "replay" in items else {}
+      saver.save(step, items, rings=rings, success_rate=rate)
+      devices.release_memory()
   return state
 
 

@@ -15,7 +15,11 @@ RENDERERS = {
   "mujoco_osmesa": "MuJoCo, OSMesa",
   "pybullet_tiny": "PyBullet, TinyRenderer",
 }
-MODULES = {"fidelity": "quality.fidelity", "peers": "peers.compare"}
+MODULES = {
+  "fidelity": "quality.fidelity",
+  "memory": "reliability.memory",
+  "peers": "peers.compare",
+}
 """Modules of benchmarks outside ``benchmarks.speed``."""
 
 UNITS = {
@@ -45,6 +49,10 @@ COLUMNS = {
   "|updates/s=updates_per_s",
   "compile_time": "task|backend|cold, s=cold.seconds|warm, s=warm.seconds"
   "|imports alone, s=imports.seconds",
+  "memory": "replays, GB=replay_gb|announced, GB=announced_gb|peak, GB=peak_gb"
+  "|steady, GB=steady_gb|new, MiB=new_mib|written, MiB=checkpoint_mib"
+  "|checkpoint, s=checkpoint_s|iteration, s=iteration_s|longest, s=longest_s"
+  "|all of it, MiB=whole_mib|s=whole_s",
   "peers": "peer|with|rate|ours / theirs (over rounds)=ratio",
 }
 """A column is HEAD=PATH:FORM; without a path the head is the key of the result."""

@@ -32,7 +32,12 @@ import numpy as np
 from apnpql_jax import errors, runtime, testing
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.envs.env import make_env
-from apnpql_jax.runs import checkpoint_reader, run_folder
+from apnpql_jax.runs import (
+  checkpoint_reader,
+  checkpoint_record,
+  run_folder,
+  segments,
+)
 from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
 from apnpql_jax.training import resume
 from apnpql_jax.training.state import example_state
@@ -270,14 +275,19 @@ def poison(run: Path, *, rewards: bool) -> None:
 
 
 def flip_a_bit(run: Path, rng: random.Random) -> str:
-  """Flips a bit in the largest file of the newest checkpoint; returns its name."""
-  folder = run / "checkpoints" / str(checkpoint_reader.latest_step(run))
-  files = [path for path in folder.rglob("*") if path.is_file()]
+  """Flips a bit in the largest file that only the newest checkpoint needs; names it."""
+  *older, newest = checkpoint_record.read_all(run).items()
+  shared = {segment.number for _, record in older for segment in record.segments}
+  folders = [run / "checkpoints" / str(newest[0])]
+  for segment in newest[1].segments:
+    if segment.number not in shared:
+      folders.append(segments.folder(run) / str(segment.number))
+  files = [path for folder in folders for path in folder.rglob("*") if path.is_file()]
   file = max(files, key=lambda path: path.stat().st_size)
   data = bytearray(file.read_bytes())
   data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
   file.write_bytes(data)
-  return str(file.relative_to(run))
+  return str(file.relative_to(run.absolute()))
 
 
 def repeat(dump: Path) -> str:

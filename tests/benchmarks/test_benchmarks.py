@@ -91,6 +91,7 @@ def dicts(tree: Any) -> Iterator[dict[str, Any]]:
     ("compile_time", []),
     ("engines", ["--variants", "barrier and cones", "Warp"]),
     ("fidelity", []),
+    ("memory", []),
   ],
 )
 def test_a_benchmark_reports_its_figures(name, args):

@@ -12,7 +12,7 @@ from hypothesis import given, settings, strategies as st
 import pytest
 
 from apnpql_jax.config import checks, codec, files, ranges, schema as config_module
-from apnpql_jax.config.checks import replay_bytes, validate
+from apnpql_jax.config.checks import PROCESS_BYTES, replay_bytes, validate
 from apnpql_jax.config.files import (
   config_diff,
   config_from_json,
@@ -199,9 +199,10 @@ def test_replay_without_room_for_a_transition_is_rejected():
 
 def test_replay_larger_than_memory_is_rejected():
   need = replay_bytes(TrainConfig())
-  validate(TrainConfig(), memory_bytes=need)
+  whole = need + PROCESS_BYTES
+  validate(TrainConfig(), memory_bytes=whole)
   with pytest.raises(ConfigError, match="GiB.*replay.capacity"):
-    validate(TrainConfig(), memory_bytes=need - 1)
+    validate(TrainConfig(), memory_bytes=whole - 1)
   # Two images of three bytes per pixel in every slot of both replays.
   slots = 51_200 + 6_400
   assert need > slots * 3 * (72 * 96 + 36 * 64)

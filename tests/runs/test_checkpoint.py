@@ -271,9 +271,10 @@ def test_missing_and_broken_checkpoints_are_refused_in_one_line(tmp_path: Path):
 
 
 def test_another_format_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-  _save(tmp_path, (1, _state(), None))
-  monkeypatch.setattr(checkpoint_record, "SCHEMA_VERSION", 9)
-  with pytest.raises(UserError, match="has format 2; this code reads 9"):
+  with monkeypatch.context() as later:
+    later.setattr(checkpoint_record, "SCHEMA_VERSION", 9)
+    _save(tmp_path, (1, _state(), None))
+  with pytest.raises(UserError, match="has format 9; this code reads up to 3"):
     _restore(tmp_path, 1, _state())
 
 
@@ -417,7 +418,7 @@ def test_a_full_disk_leaves_the_checkpoints_before_untouched(tmp_path: Path):
   _assert_same_bits(_restore(tmp_path, None, _state()), _state(1))
   with CheckpointWriter(tmp_path, CONFIG, keep=1) as writer:
     writer.save(3, {"state": _state(3)})
-    figures = writer.finished(wait=True)
+    figures = writer.proceed(wait=True)
   assert figures["checkpoint/mib"] > 0 and figures["checkpoint/wall_s"] > 0
   assert checkpoint_reader.all_steps(tmp_path) == [3]
 

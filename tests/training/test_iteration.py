@@ -24,7 +24,12 @@ from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.data import replay
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.errors import UserError
-from apnpql_jax.runs import checkpoint_reader, leaves, run_folder
+from apnpql_jax.runs import (
+  checkpoint_reader,
+  checkpoint_record,
+  leaves,
+  run_folder,
+)
 from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
 from apnpql_jax.training import resume, skipped_updates
 from apnpql_jax.training.expert import collect_expert, empty_expert
@@ -176,7 +181,9 @@ def test_another_seed_is_another_run(built):
 def _save(run: Path, built: Built, *states: tuple[TrainState, bool]) -> None:
   with CheckpointWriter(run, built.config, keep=9) as writer:
     for state, whole in states:
-      writer.save(int(state.env_steps), resume.to_items(state, whole=whole))
+      rings = resume.to_rings(state, chunk=LENGTH) if whole else {}
+      items = resume.to_items(state, whole=whole)
+      writer.save(int(state.env_steps), items, rings=rings)
 
 
 def test_a_saved_state_continues_bit_for_bit(built, iteration, tmp_path):
@@ -191,6 +198,19 @@ def test_a_saved_state_continues_bit_for_bit(built, iteration, tmp_path):
     straight, metrics = iteration(straight)
     restored, again = iteration(restored)
   assert _bits(restored) == _bits(straight) and _bits(metrics) == _bits(again)
+
+
+def test_an_episode_excluded_after_it_was_saved_stays_excluded(built, tmp_path):
+  before, steps = built.state, jnp.full(WORLDS, 2 * LENGTH)
+  ring = replay.exclude(before.replay, steps)
+  after = before.replace(replay=ring, env_steps=before.env_steps + 1)
+  assert _bits(ring) != _bits(before.replay)
+  _save(tmp_path, built, (before, True), (after, True))
+  old, new = checkpoint_record.read_all(tmp_path).values()
+  assert old.segments == new.segments and old.segments
+  example = jax.eval_shape(lambda: jax.tree.map(jnp.copy, after))
+  restored = resume.restore(built.config, tmp_path, example, pytest.fail)
+  assert _bits(restored) == _bits(after)
 
 
 def test_a_state_saved_without_replay_continues_with_an_older_one(

@@ -109,7 +109,8 @@ def compare(backend: str) -> None:
   with tempfile.TemporaryDirectory() as name:
     run = Path(name)
     with CheckpointWriter(run, config, keep=1) as writer:
-      writer.save(1, resume.to_items(state, whole=True))
+      rings = resume.to_rings(state, chunk=config.rollout_length)
+      writer.save(1, resume.to_items(state, whole=True), rings=rings)
     for key, place in (("four", several), ("one", alone)):
       example = example_state(config, place, agent)
       found = resume.restore(config, run, example, print)
