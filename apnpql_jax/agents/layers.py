@@ -37,7 +37,7 @@ class PositionwiseDense(nn.Module):
   """``nn.Dense`` for the many positions of image maps, with a faster backward pass."""
 
   features: int
-  input_scale: float = 1.0  # factor of the inputs, which never meets them: W does
+  input_scale: float = 1.0  # factor of the inputs, applied to the kernel instead
 
   @nn.compact
   def __call__(self, x: Float[Array, "*b n"]) -> Float[Array, "*b features"]:

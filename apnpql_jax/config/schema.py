@@ -100,7 +100,7 @@ class AgentConfig:
 
   candidate_precision: str = codec.added("float32")
   """Precision of the products that value candidate actions: float32, or bfloat16, which
-  is twice as fast on CPUs with AVX-512 BF16. The value head is trained in float32."""
+  is faster on CPUs with AVX-512 BF16. The value head is trained in float32."""
 
   hidden: tuple[int, ...] = (256, 256)
   """Widths of the hidden layers of each head."""

@@ -8,7 +8,6 @@ itself, because Orbax silently casts a leaf of another dtype and misses flipped 
 from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping, Sequence
-import contextlib
 import json
 import operator
 from pathlib import Path
@@ -94,15 +93,22 @@ def read(run_dir: Path, step: int) -> Record:
   return _read(folder(run_dir) / str(step) / _FILE, title(run_dir, step))
 
 
-def used_segments(run_dir: Path) -> set[int]:
-  """Returns the numbers of the segments of all readable checkpoints.
+def used_segments(run_dir: Path) -> set[int] | None:
+  """Returns the numbers of the segments of all intact checkpoints.
 
-  They include those that are being written or were set aside.
+  They include those that are being written or were set aside. Returns None if a record
+  may be intact but cannot be read, because of the file system or another format.
   """
   used = set()
   for path in run_dir.glob(f"*/*/{_FILE}"):
-    with contextlib.suppress(UserError):
+    try:
       used |= {segment.number for segment in _read(path, str(path)).segments}
+    except DamagedError as error:
+      cause = error.__context__
+      if isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError):
+        return None
+    except FileError:
+      return None
   return used
 
 

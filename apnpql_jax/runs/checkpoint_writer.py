@@ -186,7 +186,8 @@ class CheckpointWriter:
   def _delete_unused(self) -> None:
     if devices.is_primary():
       used = checkpoint_record.used_segments(self._run_dir)
-      segments.delete_unused(self._run_dir, used)
+      if used is not None:
+        segments.delete_unused(self._run_dir, used)
 
   def close(self) -> None:
     """Waits as ``wait`` does, then releases Orbax's threads.

@@ -107,7 +107,9 @@ def on_disk(run: Path) -> set[str]:
 
 
 def in_use(run: Path) -> set[str]:
-  return set(map(str, checkpoint_record.used_segments(run)))
+  used = checkpoint_record.used_segments(run)
+  assert used is not None
+  return set(map(str, used))
 
 
 def writer_of(run: Path, training: Training | None = None) -> CheckpointWriter:
@@ -129,6 +131,20 @@ def test_rings_come_back_bit_for_bit_though_training_continues(tmp_path):
     for step in newest:
       assert restored(tmp_path, step) == (step, bits(step))
     assert on_disk(tmp_path) == in_use(tmp_path)
+
+
+def test_a_record_that_cannot_be_read_now_costs_no_segment(tmp_path):
+  training = Training(CHUNK)
+  with writer_of(tmp_path) as writer:
+    training.save(writer)
+  before, (record,) = on_disk(tmp_path), tmp_path.glob("checkpoints/*/meta/metadata")
+  hidden = record.rename(tmp_path / "hidden")
+  record.mkdir()  # Raises an error of the file system, also for an administrator.
+  writer_of(tmp_path, training).close()
+  assert on_disk(tmp_path) == before
+  record.rmdir()
+  hidden.rename(record)
+  assert restored(tmp_path) == (CHUNK, bits(CHUNK))
 
 
 def test_only_parts_that_changed_are_written(tmp_path):
