@@ -40,6 +40,8 @@ def base_config(args: Train) -> TrainConfig:
   """Returns the settings that ``train`` starts from: those of the preset or the run."""
   if args.resume is not None and (args.run is not None or args.overwrite):
     raise ConfigError("--resume names the run itself; leave out --run and --overwrite")
+  if args.resume is not None and args.init_from is not None:
+    raise ConfigError("--resume has the weights of its run; leave out --init-from")
   if args.preset:
     return files.load_preset(args.preset)
   if args.resume is None:
@@ -68,6 +70,7 @@ def train(args: Train) -> Json:
       run_dir,
       resume=resume,
       overwrite=args.overwrite,
+      init_from=args.init_from,
       mesh=mesh,
       handle_signals=True,
     )

@@ -66,6 +66,10 @@ class Train(_Command):
   resume: _File = None
   """Run folder to resume from its latest checkpoint."""
 
+  init_from: Annotated[str | None, _default_hint("")] = None
+  """Run with whose weights the new one starts: RUN (its newest checkpoint), RUN:STEP or
+  RUN:best."""
+
   overwrite: _Flag = False
   """Replace the existing run in --run."""
 
