@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from concurrent import futures
 import contextlib
+import functools
 from pathlib import Path
 import signal
 import threading
@@ -285,7 +286,7 @@ def _expert(config: TrainConfig) -> ExpertReplayMaker:
   demos = demonstrations.load(path, task, config.env, allow_unsolved=allow)
   slots = config.replay.expert_steps
   _print_line(f"expert replay: {demos.instants} instants of {path} fill {slots} slots")
-  return lambda config, env, _: expert.replay_from_demonstrations(demos, config, env)
+  return functools.partial(expert.replay_from_demonstrations, demos)
 
 
 def _loop(config, start, iteration, reporter, saver, signals) -> TrainState:
