@@ -276,7 +276,11 @@ def _velocities(model: mujoco.MjModel, qpos: np.ndarray, period_s: float) -> np.
 
 
 def _bodies(model: mujoco.MjModel) -> dict[str, tuple[str, int]]:
-  """Maps each body that a recording must cover to its kind and its index."""
+  """Maps each body that a recording must cover to its kind and its index.
+
+  Raises:
+    FileError: A body has no name.
+  """
   bodies = {}
   for i in range(model.nbody):
     name, joint = model.body(i).name, model.body_jntadr[i]
@@ -284,6 +288,10 @@ def _bodies(model: mujoco.MjModel) -> dict[str, tuple[str, int]]:
       bodies[name] = ("mocap", int(model.body_mocapid[i]))
     elif joint in free_joints(model):
       bodies[name] = ("free", int(model.jnt_qposadr[joint]))
+  if "" in bodies:
+    raise FileError(
+      "a body of the scene that can move has no name, for its array in recordings"
+    )
   return bodies
 
 

@@ -150,7 +150,11 @@ class Lighting:
     """
     lights = np.flatnonzero(model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     if len(lights) != 1 or model.light_bodyid[lights[0]] != 0:
-      raise ConfigError("the scene needs exactly one directional light, in the world")
+      names = [model.light(i).name or f"light {i}" for i in lights]
+      raise ConfigError(
+        "the scene needs exactly one directional light, in the world; it has "
+        f"{', '.join(names) or 'none'} (arena.xml brings sun)"
+      )
     x, y, z = model.light_dir[lights[0]].tolist()
     return cls(direction=(x, y, z), id=int(lights[0]), **settings)
 
@@ -190,8 +194,13 @@ def _read_texture(
   kind, material = int(model.geom_type[geom_id]), model.geom_matid[geom_id]
   name, valid = _title(model, geom_id), (*HITS, int(mujoco.mjtGeom.mjGEOM_MESH))
   if kind not in valid:
-    found, *names = (mujoco.mjtGeom(x).name for x in (kind, *valid))
-    raise ConfigError(f"cannot draw {name}: {found} (valid: {', '.join(names)})")
+    found, *names = (
+      mujoco.mjtGeom(x).name.removeprefix("mjGEOM_").lower() for x in (kind, *valid)
+    )
+    raise ConfigError(
+      f"cannot draw {name}: it is of type {found} (valid: {', '.join(names)}); replace "
+      'it, hide it with group="3", or use --obs state'
+    )
   role = mujoco.mjtTextureRole.mjTEXROLE_RGB
   texture = model.mat_texid[material, role] if material >= 0 else -1
   if texture < 0:

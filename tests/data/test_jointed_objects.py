@@ -165,3 +165,13 @@ def test_a_joint_that_a_recording_cannot_have_is_named(tmp_path, joint, words):
   scene = furnished(tmp_path, body)
   with pytest.raises(FileError, match=words):
     convert(tmp_path, scene, {})
+
+
+def test_a_body_without_a_name_is_refused(tmp_path):
+  """As `replicate` may make them."""
+  one = '<body pos="0.6 0 0.1"><freejoint/><geom size="0.02" mass="1"/></body>'
+  scene = furnished(
+    tmp_path, f'<replicate count="2" offset="0.1 0 0">{one}</replicate>'
+  )
+  with pytest.raises(FileError, match="a body of the scene .* has no name"):
+    convert(tmp_path, scene, {})
