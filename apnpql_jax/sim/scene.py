@@ -122,7 +122,7 @@ def _compile(
 ) -> mujoco.MjModel:
   try:
     # MuJoCo warns of odd elements with Python's warnings, of several lines each.
-    with warnings.catch_warnings(record=True) as odd:
+    with warnings.catch_warnings(record=True, action="always") as odd:
       spec = mujoco.MjSpec.from_file(str(path))
       edit(spec)
       sizes = {key.name: len(key.qpos) for key in spec.keys}
