@@ -42,7 +42,7 @@ def base_config(args: Train) -> TrainConfig:
     raise ConfigError("--resume names the run itself; leave out --run and --overwrite")
   if args.resume is not None and args.init_from is not None:
     raise ConfigError("--resume has the weights of its run; leave out --init-from")
-  if args.preset:
+  if args.preset and args.resume is None:
     return files.load_preset(args.preset)
   if args.resume is None:
     names = ", ".join(files.preset_names())
@@ -53,6 +53,8 @@ def base_config(args: Train) -> TrainConfig:
 def train(args: Train) -> Json:
   """Trains or resumes a run and returns its summary."""
   config, resume = _with_shortcuts(args), args.resume is not None
+  if args.init_from is not None:
+    run_folder.split_origin(args.init_from)
   with contextlib.ExitStack() as stack:
     run_dir = args.resume or args.run
     if run_dir is None:

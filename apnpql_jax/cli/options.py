@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import io
 from pathlib import Path
+import re
 from typing import Annotated, TypeVar
 
 import tyro
@@ -247,6 +248,8 @@ def _unbox(text: str) -> str:
   if "╭" not in text:
     sections = sections[1:] or [[]]
   message = " ".join(sections[0]) or " ".join(text.split()) or "bad options"
+  if re.search(r"\['[^']+,[^']+'\]", message):
+    message += "; separate the values by spaces"
   for section in sections[1:]:
     options = [row for row in section if row.startswith("--")]
     if section[0].startswith("Perhaps you meant") and options:

@@ -200,6 +200,20 @@ def load_run_config(
     raise FileError(f"{path} cannot be read: {error}") from None
 
 
+def split_origin(origin: Path | str) -> tuple[Path, str | None]:
+  """Splits ``RUN``, ``RUN:STEP`` or ``RUN:best`` into the run and the rest, if any.
+
+  Raises:
+    FileError: There is no such run.
+  """
+  name, _, step = str(origin).rpartition(":")
+  number = step.isascii() and step.isdecimal() and len(step) < 20
+  if Path(origin).exists() or not (name and (number or step == "best")):
+    name, step = str(origin), ""
+  load_run_config(Path(name))
+  return Path(name), step or None
+
+
 def check_start(
   run_dir: Path, config: TrainConfig, *, resume: bool, overwrite: bool, **limits: Any
 ) -> None:

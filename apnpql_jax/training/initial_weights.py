@@ -122,13 +122,10 @@ def put(weights: Weights, state: TrainState) -> TrainState:
 
 def _parse(origin: Path | str) -> tuple[Path, int | None]:
   """Returns the run folder and the step; None for the newest."""
-  name, _, step = str(origin).rpartition(":")
-  number = step.isascii() and step.isdecimal() and len(step) < 20
-  if Path(origin).exists() or not (name and (number or step == "best")):
-    return Path(origin), None
-  run_dir = Path(name)
-  run_folder.load_run_config(run_dir)
-  return run_dir, int(step) if number else checkpoint_reader.best_step(run_dir)
+  run_dir, step = run_folder.split_origin(origin)
+  if step != "best":
+    return run_dir, None if step is None else int(step)
+  return run_dir, checkpoint_reader.best_step(run_dir)
 
 
 def _example(config: TrainConfig, mesh: Mesh | None) -> dict[str, Any]:

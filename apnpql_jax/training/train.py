@@ -117,6 +117,8 @@ def train(
     with reserved or contextlib.nullcontext():
       start = _start(config, run_dir, mesh, origin, resume=resume, overwrite=overwrite)
     _print_line(f"run folder {start.path}; compiling, which can take minutes")
+    if (done := int(start.state.env_steps)) >= config.total_steps:
+      _print_line(f"nothing to train: step {done:,} of {config.total_steps:,} is done")
     try:
       state, evaluation = _run(config, start, signals)
     except OSError as error:  # The disk is full or gone.

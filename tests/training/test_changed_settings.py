@@ -138,6 +138,9 @@ def test_a_run_goes_on_with_other_settings(tmp_path, capsys):
   # A checkpoint from before is evaluated too, though its optimizers differ.
   assert evaluate(run, episodes=2, step=24)["checkpoint_step"] == 24
   assert run_folder.load_run_config(run) == other
+  capsys.readouterr()
+  assert train(other, run, resume=True)["updates"] == 12
+  assert "nothing to train: step 56 of 56 is done" in capsys.readouterr().err
 
 
 def test_what_must_not_change_is_refused_with_the_cure(tmp_path, capsys):

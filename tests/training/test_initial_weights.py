@@ -203,4 +203,6 @@ def test_the_command_line_refuses_an_origin_that_does_not_fit(run, tmp_path, cap
   assert "do not fit: agent." in capsys.readouterr().err
   assert main(["train", "--resume", str(run), "--init-from", str(run)]) == 2
   assert "leave out --init-from" in capsys.readouterr().err
+  assert main([*new, "--init-from", f"{run}/checkpoints/1"]) == 2
+  assert "is not a run folder" in capsys.readouterr().err
   assert not (tmp_path / "new").exists()
