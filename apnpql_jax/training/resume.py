@@ -204,7 +204,7 @@ def _refilled(
 def _saved_items(
   example: TrainState, saved: TrainConfig, config: TrainConfig
 ) -> dict[str, Any]:
-  """Returns the items as ShapeDtypeStructs, as a run with the settings ``saved`` them.
+  """Returns the items, as ShapeDtypeStructs, of a run with the settings ``saved``.
 
   A constant learning rate has no counter of updates, see ``learner.make_optimizer``.
   """
