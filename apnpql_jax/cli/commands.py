@@ -40,7 +40,9 @@ def base_config(args: Train) -> TrainConfig:
   """Returns the settings that ``train`` starts from: those of the preset or the run."""
   if args.resume is not None and (args.run is not None or args.overwrite):
     raise ConfigError("--resume names the run itself; leave out --run and --overwrite")
-  if args.preset:
+  if args.resume is not None and args.init_from is not None:
+    raise ConfigError("--resume has the weights of its run; leave out --init-from")
+  if args.preset and args.resume is None:
     return files.load_preset(args.preset)
   if args.resume is None:
     names = ", ".join(files.preset_names())
@@ -51,6 +53,8 @@ def base_config(args: Train) -> TrainConfig:
 def train(args: Train) -> Json:
   """Trains or resumes a run and returns its summary."""
   config, resume = _with_shortcuts(args), args.resume is not None
+  if args.init_from is not None:
+    run_folder.split_origin(args.init_from)
   with contextlib.ExitStack() as stack:
     run_dir = args.resume or args.run
     if run_dir is None:
@@ -68,6 +72,7 @@ def train(args: Train) -> Json:
       run_dir,
       resume=resume,
       overwrite=args.overwrite,
+      init_from=args.init_from,
       mesh=mesh,
       handle_signals=True,
     )

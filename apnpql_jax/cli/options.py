@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import io
 from pathlib import Path
+import re
 from typing import Annotated, TypeVar
 
 import tyro
@@ -65,6 +66,10 @@ class Train(_Command):
 
   resume: _File = None
   """Run folder to resume from its latest checkpoint."""
+
+  init_from: Annotated[str | None, _default_hint("")] = None
+  """Run with whose weights the new one starts: RUN (its newest checkpoint), RUN:STEP or
+  RUN:best."""
 
   overwrite: _Flag = False
   """Replace the existing run in --run."""
@@ -243,6 +248,8 @@ def _unbox(text: str) -> str:
   if "╭" not in text:
     sections = sections[1:] or [[]]
   message = " ".join(sections[0]) or " ".join(text.split()) or "bad options"
+  if re.search(r"\['[^']+,[^']+'\]", message):
+    message += "; separate the values by spaces"
   for section in sections[1:]:
     options = [row for row in section if row.startswith("--")]
     if section[0].startswith("Perhaps you meant") and options:

@@ -229,11 +229,6 @@ def _check_expert(config: TrainConfig) -> None:
       "replay.expert_steps=0 leaves no room for replay.demonstrations="
       f"{replay.demonstrations}"
     )
-  if replay.demonstrations and config.env.randomize:
-    raise ConfigError(
-      f"replay.demonstrations={replay.demonstrations} cannot be used with "
-      "env.randomize: they show the world of the scene file"
-    )
 
 
 def _check_replay(config: TrainConfig, memory_bytes: int | None) -> None:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from apnpql_jax import devices
@@ -28,6 +29,7 @@ from apnpql_jax.types import ACTION_DIM
 FORMAT = "apnpql-demonstrations"
 VERSION = 1
 _SLACK = 0.05  # rad; tolerance beyond a joint limit, because MuJoCo's limits are soft
+_SLIDE_SLACK = 0.005  # m; the same for a slide
 _KINDS = {"f": "float", "iu": "integer", "b": "bool"}
 _CHUNK = 256  # instants that are judged at once
 
@@ -227,7 +229,9 @@ def check(demos: Demonstrations, scene: Scene) -> None:
   limited = model.jnt_limited.astype(bool)
   low, high = model.jnt_range[limited].T
   joints = demos.qpos[:, model.jnt_qposadr[limited]]
-  beyond = (joints < low - _SLACK) | (joints > high + _SLACK)
+  slides = model.jnt_type[limited] == mujoco.mjtJoint.mjJNT_SLIDE
+  slack = np.where(slides, _SLIDE_SLACK, _SLACK)
+  beyond = (joints < low - slack) | (joints > high + slack)
   _reject("qpos", "is beyond the limit of a joint", beyond)
   unknown = ~np.isin(demos.variant, range(variants))
   _reject("variant", "is not one of the scene's", unknown)

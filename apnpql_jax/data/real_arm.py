@@ -63,13 +63,15 @@ def convert(path: Path, scene: Scene, *, period_s: float) -> Demonstrations:
 
 def _read(arrays: dict[str, np.ndarray], scene: Scene) -> dict[str, np.ndarray]:
   """Returns the numbers, f64[n, ...], in the project's units, orders and frame."""
-  bodies = _bodies(scene.model)
-  shapes = {"time": (), "joints": (6,), "gripper": (), **dict.fromkeys(bodies, (7,))}
-  if missing := sorted(bodies.keys() - arrays.keys()):
-    raise FileError(
-      f"it lacks the poses of {', '.join(missing)}, from which rewards, labels and "
-      "images are computed; record them with the joint angles"
-    )
+  bodies, joints = _bodies(scene.model), _joints(scene)
+  shapes: dict[str, tuple[int, ...]] = {"time": (), "joints": (6,), "gripper": ()}
+  shapes |= dict.fromkeys(bodies, (7,)) | dict.fromkeys(joints, ())
+  for what, needed in (("poses of", bodies), ("positions of the joints", joints)):
+    if missing := sorted(needed.keys() - arrays.keys()):
+      raise FileError(
+        f"it lacks the {what} {', '.join(missing)}, from which rewards, labels and "
+        "images are computed; record them with the joint angles"
+      )
   named = {*_CONVENTIONS, "joint_names", "gripper_range"}
   npz.check_names(arrays.keys() - {"episode", "variant"}, shapes.keys() | named)
   count = arrays["time"].shape[:1]
@@ -86,8 +88,8 @@ def _read(arrays: dict[str, np.ndarray], scene: Scene) -> dict[str, np.ndarray]:
       raise FileError(f"{name} is not finite")
   chosen = {name: _convention(arrays, name) for name in _CONVENTIONS}
   numbers["time"] = numbers["time"] * chosen["time_unit"]
-  joints = numbers["joints"] * chosen["angle_unit"]
-  numbers["joints"] = joints[:, _joint_order(arrays["joint_names"])]
+  angles = numbers["joints"] * chosen["angle_unit"]
+  numbers["joints"] = angles[:, _joint_order(arrays["joint_names"])]
   numbers["gripper"] = _closed(numbers["gripper"], arrays["gripper_range"])
   for name in bodies:
     where, quat = np.split(numbers[name], [3], axis=1)
@@ -97,6 +99,8 @@ def _read(arrays: dict[str, np.ndarray], scene: Scene) -> dict[str, np.ndarray]:
     if chosen["frame"]:
       where, quat = _from_base(scene, where, quat)
     numbers[name] = np.concatenate([where, quat], axis=1)
+  for name, (unit, _) in joints.items():
+    numbers[name] = numbers[name] * chosen[unit]
   numbers["episode"] = arrays.get("episode", np.zeros(count))
   if numbers["episode"].shape != count:
     raise FileError("episode must have shape ['n']")
@@ -221,6 +225,8 @@ def _positions(
       qpos[:, index : index + 7] = np.concatenate([where, quat], axis=1)
     else:
       mocap_pos[:, index], mocap_quat[:, index] = where, quat
+  for name, (_, address) in _joints(scene).items():
+    qpos[:, address] = poses[name]
   return qpos, mocap_pos, mocap_quat
 
 
@@ -270,7 +276,11 @@ def _velocities(model: mujoco.MjModel, qpos: np.ndarray, period_s: float) -> np.
 
 
 def _bodies(model: mujoco.MjModel) -> dict[str, tuple[str, int]]:
-  """Maps each body that a recording must cover to its kind and its index."""
+  """Maps each body that a recording must cover to its kind and its index.
+
+  Raises:
+    FileError: A body has no name.
+  """
   bodies = {}
   for i in range(model.nbody):
     name, joint = model.body(i).name, model.body_jntadr[i]
@@ -278,4 +288,37 @@ def _bodies(model: mujoco.MjModel) -> dict[str, tuple[str, int]]:
       bodies[name] = ("mocap", int(model.body_mocapid[i]))
     elif joint in free_joints(model):
       bodies[name] = ("free", int(model.jnt_qposadr[joint]))
+  if "" in bodies:
+    raise FileError(
+      "a body of the scene that can move has no name, for its array in recordings"
+    )
   return bodies
+
+
+def _joints(scene: Scene) -> dict[str, tuple[str, int]]:
+  """Maps each joint of an object to its unit and address in qpos, free joints left out.
+
+  Raises:
+    FileError: A joint has no name of its own, or is a ball.
+  """
+  model, joints = scene.model, {}
+  taken = {"time", "joints", "gripper", "episode", "variant", *_bodies(model)}
+  taken |= {*_CONVENTIONS, "joint_names", "gripper_range"}
+  robot = model.body_rootid[model.body("base").id]
+  units = {
+    mujoco.mjtJoint.mjJNT_HINGE: "angle_unit",
+    mujoco.mjtJoint.mjJNT_SLIDE: "length_unit",
+  }
+  for i in range(model.njnt):
+    kind, name = mujoco.mjtJoint(model.jnt_type[i]), model.joint(i).name
+    if model.body_rootid[model.jnt_bodyid[i]] == robot or i in free_joints(model):
+      continue
+    where = (
+      f"{scene.name}.xml: joint {name!r} of {model.body(model.jnt_bodyid[i]).name}"
+    )
+    if kind not in units:
+      raise FileError(f"{where} is a ball joint, which recordings cannot have")
+    if not name or name in taken:
+      raise FileError(f"{where} needs a name of its own, for its array in recordings")
+    joints[name] = (units[kind], int(model.jnt_qposadr[i]))
+  return joints

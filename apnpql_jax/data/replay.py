@@ -76,6 +76,20 @@ def exclude(replay: Replay, steps: Int[Array, " worlds"]) -> Replay:
   return replay.replace(slots=slots)
 
 
+def exclude_lost(replay: Replay, start: int, stop: int) -> Replay:
+  """Marks the slots at time indices from ``start`` to ``stop`` - 1 as truncated.
+
+  So is the slot before them, which was read but leads to none. No transition touches
+  the lost ones.
+  """
+  length = replay.slots.action.shape[0]
+  marked = (jnp.arange(length) - (start - 1)) % length <= stop - start
+  timestep = replay.slots.timestep
+  truncated = timestep.truncated | marked[:, None]
+  slots = replay.slots.replace(timestep=timestep.replace(truncated=truncated))
+  return replay.replace(slots=slots)
+
+
 @jax.jit
 def episodes(replay: Replay) -> tuple[Int[Array, ""], Int[Array, ""]]:
   """Counts successes and finished episodes; an excluded one counts once as finished."""

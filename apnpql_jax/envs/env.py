@@ -9,6 +9,7 @@ world is reset in the same way, and counted.
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -65,7 +66,7 @@ class Env:
     self._bank, self._instants = bank, instants
     self._chain = arm.make_chain(scene)
     self._kinematics = make_kinematics(scene)
-    self._cameras = make_cameras(config, scene)
+    self._cameras = make_cameras(config, scene) if config.obs == "pixels" else ()
     # Traced once per number of worlds; compiled when called outside jit.
     self.begin, self.advance = jax.jit(self.begin), jax.jit(self.advance)
     self._observe = devices.per_device(jax.jit(self._judge_and_observe), mesh)
@@ -242,9 +243,37 @@ def make_env(config: EnvConfig, mesh: Mesh | None = None, *, instants: int = 0) 
   task = make_task(config.task)
   # Fail on what the scene does not allow before building the bank.
   _substeps(config, task.scene)
-  make_cameras(config, task.scene)
+  if config.obs == "pixels":
+    make_cameras(config, task.scene)
   bank, _ = load_bank(task, config.bank_rows)
   return Env(config, task, bank, mesh, instants=instants)
+
+
+def observation_shapes(config: EnvConfig, task: Task, *, instants: int) -> Observation:
+  """Returns ``EnvState.observation`` of one world as shapes, without building worlds.
+
+  ``instants`` is L of ``EnvState.recent``.
+  """
+
+  def shapes(*shape: int, dtype: type = jnp.float32) -> Any:
+    return jax.ShapeDtypeStruct((1, *((instants,) if instants else ()), *shape), dtype)
+
+  observation = Observation(robot=shapes(HISTORY * 7), tool=shapes(3))
+  if config.obs == "state":
+    model = task.scene.model
+    start = functools.partial(physics.initial_state, task.scene)
+    state = jax.eval_shape(
+      start,
+      *(
+        jnp.zeros((1, *x)) for x in ((model.nq,), (model.nmocap, 3), (model.nmocap, 4))
+      ),
+      jnp.zeros(1, jnp.int32),
+    )
+    points = jax.eval_shape(task.objects, state)
+    return observation.replace(objects=shapes(*points.shape[1:]))
+  sizes = config.global_size, config.wrist_size
+  overview, wrist = (shapes(*size, 3, dtype=jnp.uint8) for size in sizes)
+  return observation.replace(global_image=overview, wrist_image=wrist)
 
 
 def _substeps(config: EnvConfig, scene: Scene) -> int:

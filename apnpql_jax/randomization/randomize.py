@@ -9,6 +9,7 @@ tasks can measure from the table.
 from __future__ import annotations
 
 from collections.abc import Callable
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,11 @@ from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
 
 WRIST_SHARE = 0.1  # shift of the wrist camera, as a share of that of the global camera
+SEEN = (
+  "color texture light_turn light_level camera_shift camera_turn field_of_view"
+).split()
+"""Ranges of what the cameras see and the physics does not depend on."""
+
 Randomize = Callable[[PhysicsState, Array], PhysicsState]  # of states at rest and keys
 
 
@@ -46,6 +52,16 @@ def make_randomize(config: RandomizationConfig, scene: Scene) -> Randomize:
     return state.replace(qpos=qpos, fields=dict(world), command=command)
 
   return jax.vmap(one)
+
+
+def seen_only(config: RandomizationConfig) -> RandomizationConfig:
+  """Returns the ranges of what changes only what the cameras see.
+
+  In another physical world, the states of a demonstration would not follow from its
+  actions: the hand would miss a larger object, or stand above a lower table.
+  """
+  plain = {f.name: 0.0 for f in dataclasses.fields(config) if f.name not in SEEN}
+  return dataclasses.replace(config, **plain)
 
 
 def _cameras(draw: Draw, world: World) -> None:

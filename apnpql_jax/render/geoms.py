@@ -8,12 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Container, Sequence
 import dataclasses
+import functools
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from apnpql_jax.console import print_line
 from apnpql_jax.errors import ConfigError
+from apnpql_jax.render.hull import LEAST_FILL, THIN, hull_of
 from apnpql_jax.render.intersect import HITS
 
 
@@ -27,6 +30,7 @@ class Geoms:
   colors: np.ndarray  # f32[n, 3]: RGB in [0, 1]; every visible geom is drawn opaque
   checker: np.ndarray  # f32[n]: edge of a checker's squares, m; 0 for a plain geom
   checker_colors: np.ndarray  # f32[n, 3]: of squares where floor(x) + floor(y) is odd
+  hulls: dict[int, np.ndarray]  # row of a mesh -> planes f32[k, 4], see ``hull``
 
   @classmethod
   def from_model(
@@ -34,26 +38,33 @@ class Geoms:
   ) -> Geoms:
     """Reads the visible geoms: alpha above zero; default groups as in MuJoCo's viewer.
 
+    A mesh is drawn as its convex hull. A texture other than a checker on a plane is
+    drawn as its mean color, which one line reports.
+
     Raises:
-      ConfigError: A visible geom has a type without closed-form intersection, or a
-        texture other than a checker on a plane.
+      ConfigError: A visible geom is of another type, or a mesh that fills too little of
+        its hull.
     """
     rgba = _effective_rgba(model)
     ids = np.flatnonzero((rgba[:, 3] > 0) & np.isin(model.geom_group, groups))
     ids = ids[np.argsort(model.geom_type[ids], kind="stable")]
     colors, odd_colors = rgba[ids, :3].copy(), np.zeros((len(ids), 3))
-    checker = np.zeros(len(ids))
+    checker, hulls = np.zeros(len(ids)), {}
+    sizes = model.geom_size[ids].copy()
     for k, i in enumerate(ids):
+      if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_MESH:
+        hulls[k], sizes[k] = _read_hull(model, i), np.maximum(sizes[k], THIN)
       if (texture := _read_texture(model, i)) is not None:
         checker[k], even, odd = texture
         colors[k], odd_colors[k] = colors[k] * even, colors[k] * odd
     return cls(
       ids=ids.astype(np.int32),
       types=model.geom_type[ids].astype(np.int32),
-      sizes=model.geom_size[ids].astype(np.float32),
+      sizes=sizes.astype(np.float32),
       colors=colors.astype(np.float32),
       checker=checker.astype(np.float32),
       checker_colors=odd_colors.astype(np.float32),
+      hulls=hulls,
     )
 
   def rows(self, ids: Sequence[int], types: Container[int]) -> list[int]:
@@ -139,7 +150,11 @@ class Lighting:
     """
     lights = np.flatnonzero(model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     if len(lights) != 1 or model.light_bodyid[lights[0]] != 0:
-      raise ConfigError("the scene needs exactly one directional light, in the world")
+      names = [model.light(i).name or f"light {i}" for i in lights]
+      raise ConfigError(
+        "the scene needs exactly one directional light, in the world; it has "
+        f"{', '.join(names) or 'none'} (arena.xml brings sun)"
+      )
     x, y, z = model.light_dir[lights[0]].tolist()
     return cls(direction=(x, y, z), id=int(lights[0]), **settings)
 
@@ -153,21 +168,43 @@ def _effective_rgba(model: mujoco.MjModel) -> np.ndarray:
   return rgba
 
 
+def _read_hull(model: mujoco.MjModel, geom_id: int) -> np.ndarray:
+  """Returns the planes of a mesh that looks like its convex hull."""
+  planes, fill = hull_of(model, geom_id)
+  if fill < LEAST_FILL:
+    raise ConfigError(
+      f"cannot draw mesh {_title(model, geom_id)}: it fills {fill:.0%} of its convex "
+      "hull, as which meshes are drawn. Split it into convex meshes, draw primitives "
+      'and hide it with group="3", or use --obs state'
+    )
+  return planes
+
+
+def _title(model: mujoco.MjModel, geom_id: int) -> str:
+  return repr(model.geom(geom_id).name or f"geom {geom_id}")
+
+
 def _read_texture(
   model: mujoco.MjModel, geom_id: int
 ) -> tuple[float, np.ndarray, np.ndarray] | None:
-  """Reads a checker's edge (m), even and odd color; returns None without a texture."""
+  """Reads a checker's edge (m), even and odd color; returns None without a texture.
+
+  The edge is 0 for another texture, and both colors are its mean.
+  """
   kind, material = int(model.geom_type[geom_id]), model.geom_matid[geom_id]
-  name = model.geom(geom_id).name or f"geom {geom_id}"
-  if kind not in HITS:
-    found, *valid = (mujoco.mjtGeom(x).name for x in (kind, *HITS))
-    raise ConfigError(f"cannot draw {name!r}: {found} (valid: {', '.join(valid)})")
+  name, valid = _title(model, geom_id), (*HITS, int(mujoco.mjtGeom.mjGEOM_MESH))
+  if kind not in valid:
+    found, *names = (
+      mujoco.mjtGeom(x).name.removeprefix("mjGEOM_").lower() for x in (kind, *valid)
+    )
+    raise ConfigError(
+      f"cannot draw {name}: it is of type {found} (valid: {', '.join(names)}); replace "
+      'it, hide it with group="3", or use --obs state'
+    )
   role = mujoco.mjtTextureRole.mjTEXROLE_RGB
   texture = model.mat_texid[material, role] if material >= 0 else -1
   if texture < 0:
     return None
-  if kind != mujoco.mjtGeom.mjGEOM_PLANE:
-    raise ConfigError(f"cannot draw the texture of {name!r}: it is not on a plane")
   height, width = model.tex_height[texture], model.tex_width[texture]
   channels, start = model.tex_nchannel[texture], model.tex_adr[texture]
   data = model.tex_data[start : start + height * width * channels]
@@ -178,6 +215,14 @@ def _read_texture(
   size = model.geom_size[geom_id, :2]
   scale = np.where((size > 0) & ~model.mat_texuniform[material], size, 1.0)
   scale = scale / model.mat_texrepeat[material]
-  if not np.array_equal(data, expected) or scale[0] != scale[1]:
-    raise ConfigError(f"cannot draw the texture of {name!r}: not a square checker")
-  return float(scale[0]), even / 255.0, odd / 255.0
+  plane = kind == mujoco.mjtGeom.mjGEOM_PLANE
+  if plane and np.array_equal(data, expected) and scale[0] == scale[1]:
+    return float(scale[0]), even / 255.0, odd / 255.0
+  _print_once(f"the texture of {name} is drawn as its mean color")
+  mean = data.mean((0, 1)) / 255.0
+  return 0.0, mean, mean
+
+
+@functools.cache
+def _print_once(line: str) -> None:
+  print_line(line)

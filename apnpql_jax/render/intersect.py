@@ -213,7 +213,27 @@ def box_hit(g: Frames, rays: Rays, ray_light: Array) -> tuple[Array, Array]:
   return jnp.where(hit, t, MISS), cosine
 
 
-# Intersection by ``mujoco.mjtGeom``.
+def hull_hit(
+  planes: np.ndarray, g: Frames, rays: Rays, ray_light: Array
+) -> tuple[Array, Array]:
+  """Intersects a convex hull, given by ``hull.hull_of``: a slab with more faces."""
+  del ray_light
+  inv = 1.0 / jnp.maximum(g.size, TINY)
+  enter, leave = jnp.float32(-MISS), jnp.float32(MISS)
+  cosine = jnp.float32(0.0)
+  for plane in planes:
+    normal = plane[:3] * inv  # In the geom's frame, scaled with it.
+    toward = along(normal[0] * g.x + normal[1] * g.y + normal[2] * g.z, rays)
+    distance = plane[3] + (normal * g.offset).sum()
+    t = distance / jnp.where(toward == 0.0, TINY, toward)
+    lit = (normal * g.light).sum() * jax.lax.rsqrt((normal * normal).sum())
+    front = (toward < 0.0) & (t > enter)
+    enter, cosine = jnp.where(front, t, enter), jnp.where(front, lit, cosine)
+    leave = jnp.where(toward > 0.0, jnp.minimum(t, leave), leave)
+  return jnp.where(enter <= leave, enter, MISS), cosine
+
+
+# Intersection by ``mujoco.mjtGeom``; meshes have ``hull_hit``.
 HITS: dict[int, Callable[[Frames, Rays, Array], tuple[Array, Array]]] = {
   int(mujoco.mjtGeom.mjGEOM_PLANE): plane_hit,
   int(mujoco.mjtGeom.mjGEOM_SPHERE): sphere_hit,

@@ -173,7 +173,9 @@ def _cast(
   paint = jnp.full(rays.u.shape, nothing(geoms), jnp.float32)
   for k, kind in enumerate(geoms.types.tolist()):
     geom = intersect.row(frames, k)
-    t_k, cosine = intersect.HITS[kind](geom, rays, ray_light)
+    hit = intersect.HITS.get(kind)
+    hit = hit or functools.partial(intersect.hull_hit, geoms.hulls[k])
+    t_k, cosine = hit(geom, rays, ray_light)
     index = float(k)
     if look.texture is None and geoms.checker[k] > 0.0:
       edge = float(geoms.checker[k])

@@ -6,7 +6,7 @@ alone. Each is verified against the record of the checkpoint, see ``checkpoint_r
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import json
 import logging
 from pathlib import Path
@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 
 import jax
 
+from apnpql_jax.config.changes import fixed_diff
 from apnpql_jax.config.files import config_from_json
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import FileError, UserError, one_line
 from apnpql_jax.runs import checkpoint_record, leaves, segments
 from apnpql_jax.runs.checkpoint_record import DamagedError, best, newest_until, title
-from apnpql_jax.runs.run_folder import fixed_diff
 from apnpql_jax.runs.segments import Segment
 
 all_steps = checkpoint_record.steps
@@ -32,6 +32,7 @@ class Restored(NamedTuple):
   items: dict[str, Any]  # item -> pytree, as requested
   steps: dict[str, int]  # item -> step of the checkpoint it is from, at most ``step``
   damaged: list[str]  # a line for each newer checkpoint that could not be used
+  lost: list[Segment]  # that could not be read, and are zeros in the items
 
 
 def latest_step(run_dir: Path) -> int | None:
@@ -51,9 +52,11 @@ def best_step(run_dir: Path) -> int | None:
 def restore(
   run_dir: Path,
   step: int | None,
-  examples: Mapping[str, Any],
+  examples: Mapping[str, Any] | Callable[[Any], Mapping[str, Any]],
   *,
   config: TrainConfig | None = None,
+  partly: bool = False,
+  without_segments: bool = False,
 ) -> Restored:
   """Restores items of a checkpoint with the exact bits that were saved.
 
@@ -65,32 +68,61 @@ def restore(
     run_dir: The run folder.
     step: The checkpoint, without fallback; None selects the newest readable one.
     examples: Item -> pytree of the same structure, of arrays or, to save the memory of
-      a second state, ShapeDtypeStructs.
+      a second state, ShapeDtypeStructs. Or, with ``config``, a function that returns
+      them, given the settings with which the checkpoint was saved.
     config: The configuration that the checkpoint must have, except for settings that a
       resumed run may change; not checked if None.
+    partly: The pytrees are nested dicts of some arrays of the items, none of which is
+      in segments. The others are not read.
+    without_segments: If no checkpoint is intact, return the newest one of which all but
+      some segments is.
 
   Raises:
     FileError: There is no such checkpoint, it belongs to another configuration or
       format, its leaves differ from the example, or its files cannot be read.
   """
   damaged: dict[int, str] = {}
-  # Listed again each time: a run that is training makes and removes checkpoints.
-  while left := [x for x in _candidates(run_dir, step) if x not in damaged]:
-    candidate = left[0]
-    try:
-      record = checkpoint_record.read(run_dir, candidate)
-      if config is not None:
-        _check_config(title(run_dir, candidate), record.config, config)
-      steps = {name: _step_with(run_dir, candidate, name) for name in examples}
-      items = {
-        name: _restore_item(run_dir, steps[name], name, example)
-        for name, example in examples.items()
-      }
-      newer = [line for other, line in damaged.items() if other > candidate]
-      return Restored(candidate, items, steps, newer)
-    except DamagedError as error:
-      damaged[candidate] = str(error)
-  raise DamagedError("; ".join(damaged.values()))
+
+  def first(*, tolerant: bool = False) -> Restored | None:
+    tried: set[int] = set()
+    # Listed again each time: a run that is training makes and removes checkpoints.
+    while left := [x for x in _candidates(run_dir, step) if x not in tried]:
+      tried.add(left[0])
+      try:
+        lost: list[Segment] | None = [] if tolerant else None
+        found = _restore(run_dir, left[0], examples, config, partly, lost)
+        newer = [line for other, line in damaged.items() if other > left[0]]
+        return found._replace(damaged=newer)
+      except DamagedError as error:
+        damaged[left[0]] = str(error)
+    return None
+
+  found = first()
+  if found is None and without_segments:
+    found = first(tolerant=True)
+  if found is None:
+    raise DamagedError("; ".join(damaged.values()))
+  return found
+
+
+def _restore(
+  run_dir: Path,
+  step: int,
+  examples: Mapping[str, Any] | Callable[[Any], Mapping[str, Any]],
+  config: TrainConfig | None,
+  partly: bool,
+  lost: list[Segment] | None,
+) -> Restored:
+  """Restores a checkpoint; adds unreadable segments to ``lost`` unless it is None."""
+  record = checkpoint_record.read(run_dir, step)
+  saved = config and _config(title(run_dir, step), record.config, config)
+  wanted = examples if isinstance(examples, Mapping) else examples(saved)
+  steps = {name: _step_with(run_dir, step, name) for name in wanted}
+  items = {
+    name: _restore_item(run_dir, steps[name], name, example, partly, lost)
+    for name, example in wanted.items()
+  }
+  return Restored(step, items, steps, [], lost or [])
 
 
 def _candidates(run_dir: Path, step: int | None) -> list[int]:
@@ -106,13 +138,15 @@ def _candidates(run_dir: Path, step: int | None) -> list[int]:
   return [step]
 
 
-def _check_config(name: str, saved: Any, wanted: TrainConfig) -> None:
+def _config(name: str, record: Any, wanted: TrainConfig) -> TrainConfig:
+  """Returns the settings of a checkpoint, which must be the wanted ones."""
   try:
-    diff = fixed_diff(config_from_json(json.dumps(saved)), wanted)
+    saved = config_from_json(json.dumps(record))
   except UserError as error:
     raise FileError(f"{name}: {error}") from None
-  if diff:
+  if diff := fixed_diff(saved, wanted):
     raise FileError(f"{name} belongs to other settings: {diff}")
+  return saved
 
 
 def _step_with(run_dir: Path, last: int, item: str) -> int:
@@ -125,10 +159,19 @@ def _step_with(run_dir: Path, last: int, item: str) -> int:
   return step
 
 
-def _restore_item(run_dir: Path, step: int, item: str, example: Any) -> Any:
+def _restore_item(
+  run_dir: Path,
+  step: int,
+  item: str,
+  example: Any,
+  partly: bool,
+  lost: list[Segment] | None,
+) -> Any:
   name = title(run_dir, step)
   record = checkpoint_record.read(run_dir, step)
   saved = record.items[item]
+  if partly:
+    saved = {path: saved[path] for path in leaves.named(example) if path in saved}
   wanted = {path: leaves.kind(leaf) for path, leaf in leaves.named(example).items()}
   for path in sorted(saved.keys() | wanted.keys()):
     held = saved[path].kind if path in saved else "nothing"
@@ -138,7 +181,7 @@ def _restore_item(run_dir: Path, step: int, item: str, example: Any) -> Any:
   apart = {path for path, leaf in saved.items() if leaf.crc32 is None}
   folder = checkpoint_record.folder(run_dir) / str(step) / item
   crc32s = {path: leaf.crc32 for path, leaf in saved.items()}
-  tree = _read(folder, leaves.without(example, apart), crc32s, name)
+  tree = _read(folder, leaves.without(example, apart), crc32s, name, partly)
   impls = {path: leaf.key_impl for path, leaf in saved.items() if leaf.key_impl}
   try:
     tree = leaves.to_typed(tree, impls, example)  # With zeros for arrays apart.
@@ -147,15 +190,22 @@ def _restore_item(run_dir: Path, step: int, item: str, example: Any) -> Any:
   arrays = leaves.named(tree)
   rings = {f"{item}/{path}": arrays.pop(path) for path in apart}
   del tree  # The rings are donated.
-  rings = _fill(run_dir, rings, record.segments, name)
+  rings = _fill(run_dir, rings, record.segments, name, lost)
   arrays |= {path: rings[f"{item}/{path}"] for path in apart}
   return leaves.fill(example, arrays)
 
 
 def _fill(
-  run_dir: Path, rings: dict[str, Any], held: Sequence[Segment], name: str
+  run_dir: Path,
+  rings: dict[str, Any],
+  held: Sequence[Segment],
+  name: str,
+  lost: list[Segment] | None,
 ) -> dict[str, Any]:
-  """Returns the rings with their segments written into them, in place."""
+  """Returns the rings with their segments written into them, in place.
+
+  Adds those that cannot be read to ``lost``; raises ``DamagedError`` if it is None.
+  """
   found = set()
   for segment in held:
     paths = segment.crc32s.keys()
@@ -164,27 +214,48 @@ def _fill(
     rows = segment.stop - segment.start
     if not paths <= rings.keys() or segment.stop > min(len(rings[x]) for x in paths):
       raise DamagedError(f"{name} cannot be read: a segment is not within its ring")
-    target = {path: rings.pop(path) for path in paths}
+    found |= paths
     shapes = {
       path: jax.ShapeDtypeStruct((rows, *x.shape[1:]), x.dtype, sharding=x.sharding)
-      for path, x in target.items()
+      for path, x in rings.items()
+      if path in paths
     }
     folder = segments.folder(run_dir) / str(segment.number)
-    part = _read(folder, segments.to_tree(shapes), segment.crc32s, name)
+    try:
+      part = _read(folder, segments.to_tree(shapes), segment.crc32s, name)
+    except DamagedError:
+      if lost is None:
+        raise
+      lost.append(segment)
+      continue
+    target = {path: rings.pop(path) for path in paths}
     rings |= segments.put(target, leaves.named(part), segment.start)
-    found |= paths
   if missing := rings.keys() - found:
     raise DamagedError(f"{name} cannot be read: no segment holds {min(missing)}")
   return rings
 
 
-def _read(folder: Path, example: Any, crc32s: Mapping[str, int | None], name: str):
+def _read(
+  folder: Path,
+  example: Any,
+  crc32s: Mapping[str, int | None],
+  name: str,
+  partly: bool = False,
+) -> Any:
   """Returns a tree of arrays without typed keys, compared with its checksums."""
   import orbax.checkpoint as ocp
 
+  wanted = leaves.abstract(example)
   try:
-    with ocp.StandardCheckpointer() as reader:
-      tree = reader.restore(folder, leaves.abstract(example))
+    if partly:
+      kinds = ocp.checkpoint_utils.construct_restore_args(wanted)
+      with ocp.PyTreeCheckpointer() as reader:
+        tree = reader.restore(
+          folder, ocp.args.PyTreeRestore(wanted, kinds, partial_restore=True)
+        )
+    else:
+      with ocp.StandardCheckpointer() as reader:
+        tree = reader.restore(folder, wanted)
   except (MemoryError, PermissionError):
     raise  # Not caused by the checkpoint.
   except Exception as error:  # Any error of Orbax or the file system.

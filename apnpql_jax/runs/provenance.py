@@ -1,7 +1,8 @@
-"""Record of the versions, commit and devices that a run was started with."""
+"""Record of what a run was started with and what was changed, in ``versions.json``."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 import datetime
 from importlib import metadata
 import json
@@ -9,6 +10,15 @@ from pathlib import Path
 import platform
 import subprocess
 from typing import Any
+
+from apnpql_jax.runs.text import read_text, write_text
+
+FILE = "versions.json"
+
+_MAX_BYTES = 1 << 20
+
+_OF_THE_RUN = ("created", "origin", "changes")
+"""Entries that do not describe the machine and its software."""
 
 _PACKAGES = (
   "apnpql-jax jax jaxlib flax optax distrax orbax-checkpoint mujoco mujoco-mjx mink "
@@ -24,13 +34,13 @@ def changed_versions(run_dir: Path, *, devices: int = 1) -> list[str]:
   """
   from apnpql_jax.runs import leaves
 
-  try:
-    record = (run_dir / "versions.json").read_text(encoding="utf-8")
-    old = leaves.named(json.loads(record))
-  except (OSError, ValueError):
-    return ["versions.json cannot be read"]
-  new = leaves.named(describe_versions(devices))
-  names = sorted((old.keys() | new.keys()) - {"created"})
+  if (record := read(run_dir)) is None:
+    return [f"{FILE} cannot be read"]
+  old, new = (
+    leaves.named({k: x for k, x in versions.items() if k not in _OF_THE_RUN})
+    for versions in (record, describe_versions(devices))
+  )
+  names = sorted(old.keys() | new.keys())
   return [
     f"{name.rpartition('/')[2]} {old.get(name)} -> {new.get(name)}"
     for name in names
@@ -38,12 +48,37 @@ def changed_versions(run_dir: Path, *, devices: int = 1) -> list[str]:
   ]
 
 
+def read(run_dir: Path) -> dict[str, Any] | None:
+  """Returns the record of a run, or None if it cannot be read."""
+  try:
+    record = json.loads(read_text(run_dir / FILE, _MAX_BYTES))
+  except (OSError, ValueError, RecursionError):
+    return None
+  return record if isinstance(record, dict) else None
+
+
+def write(run_dir: Path, record: Mapping[str, Any]) -> None:
+  """Writes the record of a run."""
+  write_text(run_dir / FILE, json.dumps(record, indent=2) + "\n")
+
+
+def record_change(
+  run_dir: Path, step: int, settings: Mapping[str, tuple[Any, Any]]
+) -> None:
+  """Adds to the record that ``settings`` (name -> old, new) change at ``step``."""
+  record = read(run_dir) or {}
+  earlier = record.get("changes")
+  change = {"step": step, "created": _now(), "settings": settings}
+  changes = [*(earlier if isinstance(earlier, list) else []), change]
+  write(run_dir, record | {"changes": changes})
+
+
 def describe_versions(devices: int) -> dict[str, Any]:
   """Returns versions of Python and packages, git commit of a checkout, devices."""
   import jax  # Here, so that run folders can be named without JAX.
 
   return {
-    "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    "created": _now(),
     "python": platform.python_version(),
     "platform": platform.platform(),
     "packages": {name: _version(name) for name in _PACKAGES},
@@ -54,6 +89,10 @@ def describe_versions(devices: int) -> dict[str, Any]:
       "count": devices,
     },
   }
+
+
+def _now() -> str:
+  return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
 
 
 def _version(package: str) -> str | None:

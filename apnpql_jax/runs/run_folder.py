@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 import contextlib
 import fcntl
-import json
 import os
 from pathlib import Path
 import shutil
 from typing import Any, NamedTuple
 
 from apnpql_jax.atomic import check_utf8, check_writable, existing
-from apnpql_jax.config import files
+from apnpql_jax.config import changes, files
 from apnpql_jax.config.checks import validate
 from apnpql_jax.config.schema import TrainConfig
-from apnpql_jax.errors import ConfigError, FileError, UserError
-from apnpql_jax.runs.provenance import describe_versions
+from apnpql_jax.errors import FileError, UserError
+from apnpql_jax.runs import provenance, signals
 from apnpql_jax.runs.text import read_text, write_text
 
 CONFIG_FILE = "config.json"
@@ -27,13 +26,6 @@ _MAX_CONFIG_BYTES = 1 << 20
 _PATTERN = "*?[]\\"
 """Characters that Orbax takes for patterns, so that it would find no file or others."""
 
-MAY_CHANGE = (
-  "total_steps eval_every eval_episodes eval_acting checkpoint_every "
-  "keep_checkpoints save_replay_every max_skipped_updates video sinks "
-  "wandb_project wandb_entity wandb_id"
-).split()
-"""Settings that a resumed run may change, because they do not affect learning."""
-
 
 class RunFolder(NamedTuple):
   """A run folder that exists and holds ``config.json``."""
@@ -43,12 +35,27 @@ class RunFolder(NamedTuple):
 
 
 def create(
-  run_dir: Path, config: TrainConfig, *, overwrite: bool = False, devices: int = 1
+  run_dir: Path,
+  config: TrainConfig,
+  *,
+  overwrite: bool = False,
+  devices: int = 1,
+  origin: Mapping[str, Any] | None = None,
+  write_more: Callable[[Path], None] | None = None,
 ) -> RunFolder:
   """Creates a folder with ``config.json`` and ``versions.json``.
 
   It is filled under another name, so that a process killed meanwhile leaves the run to
   overwrite intact.
+
+  Args:
+    run_dir: The run folder.
+    config: Settings of the run.
+    overwrite: The run may replace another one.
+    devices: Number of devices, recorded with the versions.
+    origin: Where the weights that the run starts with come from; None if they are
+      drawn.
+    write_more: Writes other files of the new run into the folder that it is given.
 
   Raises:
     FileError: The folder holds a run and ``overwrite`` is not set, it holds anything
@@ -56,12 +63,15 @@ def create(
   """
   _check_characters(run_dir, _PATTERN)
   _check_replaceable(run_dir, overwrite=overwrite)
-  versions = json.dumps(describe_versions(devices), indent=2) + "\n"
+  versions = provenance.describe_versions(devices)
+  versions |= {"origin": origin} if origin else {}
   run_dir = run_dir.absolute()
   new, old = _free_name(run_dir, "new"), _free_name(run_dir, "replaced")
   try:
     new.mkdir(parents=True)
-    write_text(new / "versions.json", versions)
+    provenance.write(new, versions)
+    if write_more:
+      write_more(new)
     write_text(new / CONFIG_FILE, files.config_to_json(config))
     if run_dir.exists():
       run_dir.rename(old)
@@ -90,6 +100,20 @@ def open_run(run_dir: Path) -> RunFolder:
       if path.is_symlink() and not path.resolve().is_relative_to(inside):
         raise FileError(f"{path} is a link that leads out of the run folder")
   return RunFolder(run_dir.absolute(), load_run_config(run_dir))
+
+
+def change(run_dir: Path, config: TrainConfig, *, step: int) -> str:
+  """Replaces the settings of a run that goes on from ``step``, and records the change.
+
+  Returns:
+    The differences as one line, "" if there are none.
+  """
+  diff = files.config_diff(load_run_config(run_dir), config)
+  if diff:
+    # First: a process killed in between repeats the record at the next resume.
+    provenance.record_change(run_dir, step, diff)
+    write_text(run_dir / CONFIG_FILE, files.config_to_json(config))
+  return files.format_diff(diff)
 
 
 @contextlib.contextmanager
@@ -137,11 +161,14 @@ def _make(run_dir: Path) -> bool:
 
 @contextlib.contextmanager
 def _removed_if_empty(folder: Path) -> Generator[None, None, None]:
+  path = folder.absolute()
+  signals.EMPTY_FOLDERS.add(path)
   try:
     yield
   finally:
+    signals.EMPTY_FOLDERS.discard(path)
     with contextlib.suppress(OSError):
-      folder.rmdir()
+      path.rmdir()
 
 
 def load_run_config(
@@ -173,10 +200,18 @@ def load_run_config(
     raise FileError(f"{path} cannot be read: {error}") from None
 
 
-def fixed_diff(saved: TrainConfig, wanted: TrainConfig) -> str:
-  """Returns the differences outside of ``MAY_CHANGE`` as one line, "" if none."""
-  diff = files.config_diff(saved, wanted)
-  return files.format_diff({k: x for k, x in diff.items() if k not in MAY_CHANGE})
+def split_origin(origin: Path | str) -> tuple[Path, str | None]:
+  """Splits ``RUN``, ``RUN:STEP`` or ``RUN:best`` into the run and the rest, if any.
+
+  Raises:
+    FileError: There is no such run.
+  """
+  name, _, step = str(origin).rpartition(":")
+  number = step.isascii() and step.isdecimal() and len(step) < 20
+  if Path(origin).exists() or not (name and (number or step == "best")):
+    name, step = str(origin), ""
+  load_run_config(Path(name))
+  return Path(name), step or None
 
 
 def check_start(
@@ -206,17 +241,13 @@ def check_resumable(run_dir: Path, wanted: TrainConfig) -> None:
   """Checks that a run can be resumed with these settings.
 
   Raises:
-    ConfigError: A setting outside of ``MAY_CHANGE`` differs; the message lists each.
+    ConfigError: A setting that must not change differs, see ``config/changes.py``.
     FileError: Another process trains the run, or checkpoints cannot be saved under its
       path.
   """
   _check_characters(run_dir, _PATTERN)
   check_writable(run_dir)
-  if diff := fixed_diff(load_run_config(run_dir), wanted):
-    raise ConfigError(
-      f"{str(run_dir)!r} was made with other settings: {diff}; resume it without them "
-      f"(only {', '.join(MAY_CHANGE)} may change), or start a new run"
-    )
+  changes.check_resumed(load_run_config(run_dir), wanted, str(run_dir))
   _check_idle(run_dir)
 
 
@@ -282,33 +313,33 @@ def _check_replaceable(run_dir: Path, *, overwrite: bool) -> None:
     )
 
 
-def check_disk(run_dir: Path, checkpoint_bytes: int, *, kept: int) -> str:
+def check_disk(run_dir: Path, next_bytes: int, all_bytes: int) -> str:
   """Checks that the disk has room for a checkpoint of at most this size.
 
   Checkpoints are compressed, so that fewer bytes may do.
 
   Args:
     run_dir: The run folder, which may not exist yet.
-    checkpoint_bytes: Size before compression.
-    kept: Number of checkpoints that exist at the same time.
+    next_bytes: Size of the next checkpoint before compression.
+    all_bytes: The same for all that exist at the same time.
 
   Returns:
-    A warning if there may be no room for all ``kept``, else "".
+    A warning if there may be no room for all, else "".
 
   Raises:
     FileError: There is no room for one.
   """
-  size = checkpoint_bytes / 2**30
+  one, every = next_bytes / 2**30, all_bytes / 2**30
   free = shutil.disk_usage(existing(run_dir)).free / 2**30
-  if size > free:
+  if one > free:
     raise FileError(
-      f"a checkpoint needs up to {size:.2f} GiB, but the disk of {str(run_dir)!r} has "
+      f"a checkpoint needs up to {one:.2f} GiB, but the disk of {str(run_dir)!r} has "
       f"{free:.2f} GiB; free some, or lower replay.capacity"
     )
-  if kept * size > free:
+  if every > free:
     return (
-      f"the disk has {free:.2f} GiB, but {kept} checkpoints need up to "
-      f"{kept * size:.2f} GiB; lower keep_checkpoints or replay.capacity"
+      f"the disk has {free:.2f} GiB, but the checkpoints that are kept need up to "
+      f"{every:.2f} GiB together; lower keep_checkpoints or replay.capacity"
     )
   return ""
 

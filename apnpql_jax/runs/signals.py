@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
+from pathlib import Path
 import signal
 import sys
 import threading
@@ -16,6 +17,9 @@ import time
 from typing import Any
 
 from apnpql_jax.errors import INTERRUPTED
+
+EMPTY_FOLDERS: set[Path] = set()
+"""Folders that a process which is ended at once removes, those that are empty."""
 
 _ONE_REQUEST_S = 1.0
 """Signals closer than this are one: `timeout` and batch systems send it twice."""
@@ -74,6 +78,9 @@ class Signals:
   def _end(self, number: int) -> None:
     for child in multiprocessing.active_children():
       child.kill()  # They would wait for work forever.
+    for path in tuple(EMPTY_FOLDERS):
+      with contextlib.suppress(OSError):
+        path.rmdir()
     if sys.stderr.isatty():
       os.write(2, b"\x1b[?25h")  # The cursor, which a progress bar hides.
     _write(f"apnpql: {self._message}")

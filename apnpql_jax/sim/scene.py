@@ -10,12 +10,14 @@ from collections.abc import Callable, Sequence
 import dataclasses
 import hashlib
 import pathlib
+import warnings
 
 import mujoco
 from mujoco import mjx
 import numpy as np
 
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.console import print_line
+from apnpql_jax.errors import ConfigError, one_line
 from apnpql_jax.sim import scene_checks
 
 ARM_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -119,13 +121,16 @@ def _compile(
   path: pathlib.Path, edit: Callable[[mujoco.MjSpec], None]
 ) -> mujoco.MjModel:
   try:
-    spec = mujoco.MjSpec.from_file(str(path))
-    edit(spec)
-    sizes = {key.name: len(key.qpos) for key in spec.keys}
-    model = spec.compile()
+    # MuJoCo warns of odd elements with Python's warnings, of several lines each.
+    with warnings.catch_warnings(record=True, action="always") as odd:
+      spec = mujoco.MjSpec.from_file(str(path))
+      edit(spec)
+      sizes = {key.name: len(key.qpos) for key in spec.keys}
+      model = spec.compile()
   except ValueError as error:
-    reason = str(error).splitlines()[0]
-    raise ConfigError(f"{path.name} does not compile: {reason}") from error
+    raise ConfigError(f"{path.name} does not compile: {one_line(error)}") from error
+  for warning in odd:
+    print_line(f"{path.name}: {one_line(Warning(warning.message))}")
   for name, size in sizes.items():  # MuJoCo would complete it silently.
     if size != model.nq:
       raise ConfigError(

@@ -72,10 +72,10 @@ def diagnose(
       mean return, which is zero in failed episodes.
   """
   evaluate.check_count(episodes, seed)
-  config, env, agent, learner, step = evaluate.load_trained(
+  config, env, agent, params, step = evaluate.load_trained(
     run_dir, backend=backend, step=step
   )
-  params, solved = learner.target_params, {}
+  solved = {}
   for acting in ACTING:
     play = make_player(env, lambda p, rule=acting: agent_policy(agent, p, acting=rule))
     played = evaluate.play_held_out(env, play, params, episodes=episodes, seed=seed)

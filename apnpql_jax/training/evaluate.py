@@ -14,12 +14,13 @@ from jaxtyping import PRNGKeyArray
 import numpy as np
 
 from apnpql_jax import devices
-from apnpql_jax.agents.learner import Agent, LearnerState, make_agent
+from apnpql_jax.agents.learner import Agent, make_agent
+from apnpql_jax.agents.networks import Params
 from apnpql_jax.atomic import check_utf8, check_writable
 from apnpql_jax.config.checks import ACTING, check_env
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.console import print_line, reporting
-from apnpql_jax.envs.env import Env, make_env
+from apnpql_jax.envs.env import Env, make_env, observation_shapes
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs import abandoned_tasks, checkpoint_reader, leaves, run_folder
 from apnpql_jax.runs.metrics import wilson_interval
@@ -117,10 +118,10 @@ def evaluate(
   began, video = time.monotonic(), _check(episodes, seed, video)
   if acting is not None:
     check_name("acting", acting, ACTING)
-  config, env, agent, learner, step = load_trained(run_dir, backend=backend, step=step)
+  config, env, agent, params, step = load_trained(run_dir, backend=backend, step=step)
   acting = acting or config.eval_acting
   play = make_player(env, lambda params: agent_policy(agent, params, acting=acting))
-  played = play_held_out(env, play, learner.target_params, episodes=episodes, seed=seed)
+  played = play_held_out(env, play, params, episodes=episodes, seed=seed)
   about = {"algorithm": config.agent.algorithm, "acting": acting}
   return _summary(env, played, about, step, began, video)
 
@@ -131,14 +132,14 @@ class Trained(NamedTuple):
   config: TrainConfig
   env: Env
   agent: Agent
-  learner: LearnerState
+  params: Params  # those that act
   step: int  # of the checkpoint
 
 
 def load_trained(
   run_dir: Path | str, *, backend: str | None, step: int | None
 ) -> Trained:
-  """Restores the learner of a run, and builds its worlds and agent.
+  """Restores the weights of a run, and builds its worlds and agent.
 
   ``backend`` and ``step`` are as in ``evaluate``, and so are the errors.
   """
@@ -149,17 +150,17 @@ def load_trained(
   checkpoint_reader.restore(run_dir, step, {}, config=config)  # Fails early.
   env = make_env(env_config, instants=config.agent.lstm_instants)
   agent = make_agent(config.agent)
-  example = jax.eval_shape(
-    lambda rows: agent.init(jax.random.key(0), env.reset(rows).observation),
-    jnp.zeros(1, jnp.int32),
-  )
-  devices.check_memory(leaves.nbytes(example), "the learner")
+  shapes = observation_shapes(config.env, env.task, instants=config.agent.lstm_instants)
+  learner = jax.eval_shape(agent.init, jax.random.key(0), shapes)
+  example = {"target_params": learner.target_params}
+  devices.check_memory(leaves.nbytes(example), "the network")
   with abandoned_tasks.silenced():
     wanted = {"learner": example}
-    found = checkpoint_reader.restore(run_dir, step, wanted, config=config)
+    found = checkpoint_reader.restore(run_dir, step, wanted, config=config, partly=True)
   for line in found.damaged:
     print_line(line)
-  return Trained(config, env, agent, found.items["learner"], found.step)
+  params = found.items["learner"]["target_params"]
+  return Trained(config, env, agent, params, found.step)
 
 
 def evaluate_expert(

@@ -16,6 +16,8 @@ from apnpql_jax.data.demonstrations import Demonstrations
 from apnpql_jax.data.replay import Replay
 from apnpql_jax.envs.env import Env
 from apnpql_jax.envs.state import Arrival, EnvState
+from apnpql_jax.randomization.randomize import make_randomize, seen_only
+from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.training.placement import place
 from apnpql_jax.training.rollout import (
   add_chunk,
@@ -60,13 +62,24 @@ def collect_expert(config: TrainConfig, env: Env, key: PRNGKeyArray) -> Replay |
 
 
 def replay_from_demonstrations(
-  demos: Demonstrations, config: TrainConfig, env: Env
+  demos: Demonstrations,
+  config: TrainConfig,
+  env: Env,
+  key: PRNGKeyArray | None = None,
 ) -> Replay:
   """Returns an expert replay made from demonstrations.
 
   The columns of the ring hold consecutive stretches of them, repeated or cut off to
-  fill ``replay.expert_steps`` slots.
+  fill ``replay.expert_steps`` slots. With ``env.randomize``, each episode in it draws
+  what the cameras see; the physics of a demonstration is that of its recording.
+
+  Args:
+    demos: The demonstrations.
+    config: Settings of the run.
+    env: Its worlds.
+    key: Draws what is seen; that of the run's seed if None.
   """
+  key = jax.random.key(config.seed) if key is None else key
   worlds, length = config.env.worlds, _length(config)
   index = np.resize(np.arange(demos.instants), (worlds, length)).T
   slots = demos.rows(index)
@@ -77,13 +90,24 @@ def replay_from_demonstrations(
     demos, index[slots.first], env.task
   )
 
+  episode = np.cumsum(slots.first.T).reshape(worlds, length).T
+  randomize = None
+  if config.env.randomize:
+    randomize = make_randomize(seen_only(config.env.randomization), env.task.scene)
+
+  def states(shown: Demonstrations, episode: Array | np.ndarray) -> PhysicsState:
+    now = shown.states(env.task.scene)
+    if randomize is None:
+      return now
+    return randomize(now, jax.vmap(jax.random.fold_in, (None, 0))(key, episode))
+
   @jax.jit
   def remake(
-    start: EnvState, slots: Demonstrations, targets: Array, ends: Array
+    start: EnvState, slots: Demonstrations, targets: Array, ends: Array, episode: Array
   ) -> Replay:
     def step(before: EnvState, inputs: tuple) -> tuple[EnvState, Slot]:
-      shown, targets, ends = inputs
-      now = shown.states(env.task.scene)
+      shown, targets, ends, episode = inputs
+      now = states(shown, episode)
       state = env.observe(Arrival.after(before, now, targets, shown.first))
       timestep = state.timestep
       timestep = timestep.replace(
@@ -92,12 +116,14 @@ def replay_from_demonstrations(
       action = jnp.asarray(shown.action, jnp.float32)
       return state, Slot(timestep, action, jnp.full(worlds, CERTAIN, jnp.float32))
 
-    _, chunk = jax.lax.scan(step, start, (slots, targets, ends))
+    _, chunk = jax.lax.scan(step, start, (slots, targets, ends, episode))
     ring = replay.add(replay.create(example_slot(start), length, worlds), chunk)
     return place(ring, env.mesh)
 
   start = env.reset(jnp.zeros(worlds, jnp.int32))
-  return remake(start, slots, targets, ends)
+  # The fields that are drawn are fewer than those of the worlds.
+  start = start.replace(physics=states(slots.rows(np.array(0)), episode[0]))
+  return remake(start, slots, targets, ends, episode)
 
 
 def record_expert(

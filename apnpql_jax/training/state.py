@@ -42,8 +42,7 @@ def initial_state(
   config: TrainConfig, env: Env, agent: Agent, expert: ExpertReplayMaker
 ) -> TrainState:
   """Returns the state of a new run; ``expert`` makes the expert replay."""
-  keys = jax.random.split(jax.random.key(config.seed), 5)
-  key, row_key, init_key, expert_key, fault_key = keys
+  key, row_key, init_key, expert_key, fault_key = _keys(config)
   rows = jax.random.randint(row_key, (config.env.worlds,), 0, env.bank_split)
 
   @jax.jit
@@ -66,6 +65,18 @@ def initial_state(
   state = state.replace(expert_replay=expert(config, env, expert_key))
   # Committed to its devices like a restored state, so that both use one compilation.
   return jax.device_put(state, shardings(state, env.mesh))
+
+
+def initial_expert(
+  config: TrainConfig, env: Env, expert: ExpertReplayMaker
+) -> Replay | None:
+  """Returns the expert replay of ``initial_state`` alone."""
+  ring = expert(config, env, _keys(config)[3])
+  return jax.device_put(ring, shardings(ring, env.mesh))
+
+
+def _keys(config: TrainConfig) -> PRNGKeyArray:
+  return jax.random.split(jax.random.key(config.seed), 5)
 
 
 def example_state(config: TrainConfig, env: Env, agent: Agent) -> TrainState:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from concurrent import futures
 import contextlib
+import functools
 from pathlib import Path
 import signal
 import threading
@@ -38,12 +39,23 @@ from apnpql_jax.runs.progress import TrainProgress
 from apnpql_jax.runs.signals import Signals
 from apnpql_jax.runs.sinks import check_sinks, make_sinks
 from apnpql_jax.tasks import make_task, task_names
-from apnpql_jax.training import expert, skipped_updates
+from apnpql_jax.training import expert, initial_weights, skipped_updates
 from apnpql_jax.training.expert import ExpertReplayMaker, collect_expert
 from apnpql_jax.training.iteration import Iteration, compile_iteration
 from apnpql_jax.training.reporter import Reporter
-from apnpql_jax.training.resume import restore, set_aside, to_items, to_rings
-from apnpql_jax.training.state import TrainState, example_state, initial_state
+from apnpql_jax.training.resume import (
+  disk_bytes,
+  restore_run,
+  set_aside,
+  to_items,
+  to_rings,
+)
+from apnpql_jax.training.state import (
+  TrainState,
+  example_state,
+  initial_expert,
+  initial_state,
+)
 
 
 class Start(NamedTuple):
@@ -55,6 +67,7 @@ class Start(NamedTuple):
   path: Path  # of the run folder, absolute
   state: TrainState
   resume_step: int | None  # None for a new run
+  on_disk: bool = False  # the replays are what the newest checkpoints have
 
 
 def train(
@@ -63,6 +76,7 @@ def train(
   *,
   resume: bool = False,
   overwrite: bool = False,
+  init_from: Path | str | None = None,
   mesh: Mesh | None = None,
   handle_signals: bool = False,
 ) -> dict[str, Any]:
@@ -73,6 +87,8 @@ def train(
     run_dir: The run folder.
     resume: Resume from the newest readable checkpoint in ``run_dir``.
     overwrite: Replace the run in ``run_dir`` as soon as the new one can start.
+    init_from: ``RUN``, ``RUN:STEP`` or ``RUN:best``: another run with whose weights
+      this one starts. Optimizers and replay start empty.
     mesh: Devices to train on; the default device if None.
     handle_signals: Save and stop at SIGINT or SIGTERM. The process ends at once if
       there is nothing to save yet, and at a second signal. Python allows this in the
@@ -88,6 +104,9 @@ def train(
   """
   run_dir = Path(run_dir)
   _check(config, run_dir, mesh, resume, overwrite, handle_signals)
+  if init_from is not None and resume:
+    raise ConfigError("a resumed run has weights; leave out init_from")
+  origin = None if init_from is None else initial_weights.find(init_from, config)
   hint = f"to continue: --resume {run_dir}"
   signals = Signals(
     f"stopped before the first iteration; {hint if resume else 'nothing is saved'}"
@@ -96,8 +115,10 @@ def train(
   with handled, abandoned_tasks.silenced():
     reserved = run_folder.reserve(run_dir) if devices.is_primary() else None
     with reserved or contextlib.nullcontext():
-      start = _start(config, run_dir, mesh, resume=resume, overwrite=overwrite)
+      start = _start(config, run_dir, mesh, origin, resume=resume, overwrite=overwrite)
     _print_line(f"run folder {start.path}; compiling, which can take minutes")
+    if (done := int(start.state.env_steps)) >= config.total_steps:
+      _print_line(f"nothing to train: step {done:,} of {config.total_steps:,} is done")
     try:
       state, evaluation = _run(config, start, signals)
     except OSError as error:  # The disk is full or gone.
@@ -153,6 +174,10 @@ def _run(
       stack.enter_context(run_folder.lock(path))
       if resume_step is not None and (aside := set_aside(path, resume_step)):
         print_line(f"later checkpoints and a copy of the metrics were moved to {aside}")
+      if resume_step is not None and (
+        changed := run_folder.change(path, config, step=resume_step)
+      ):
+        print_line(f"settings changed at step {resume_step:,}: {changed}")
     devices.barrier()
     if devices.is_primary():
       settings = dict(codec.flatten(config))
@@ -164,7 +189,10 @@ def _run(
       reporter = Reporter(config, env, start.agent, path, writer, progress)
     rings = to_rings(start.state, chunk=config.rollout_length)
     saver = CheckpointWriter(
-      path, config, keep=config.keep_checkpoints, restored=rings if resume_step else {}
+      path,
+      config,
+      keep=config.keep_checkpoints,
+      restored=rings if start.on_disk else {},
     )
     stack.enter_context(saver)
     del rings
@@ -182,6 +210,7 @@ def _start(
   config: TrainConfig,
   run_dir: Path,
   mesh: Mesh | None,
+  origin: tuple[Path, int] | None,
   *,
   resume: bool,
   overwrite: bool,
@@ -196,14 +225,16 @@ def _start(
   if saved:
     checkpoint_reader.restore(run_dir, None, {}, config=config)  # Fails early.
   fill = None if saved else _expert(config)
+  weights = initial_weights.read(path) if resume and not saved else None
+  if origin:
+    weights = initial_weights.load(*origin, config, mesh)
+    about = weights.origin
+    _print_line(f"starting with the weights of {about['run']}, step {about['step']:,}")
   agent = make_agent(config.agent)  # Before the worlds, which can take minutes.
   env = make_env(config.env, mesh, instants=config.agent.lstm_instants)
   example = example_state(config, env, agent)
   devices.check_memory(needed_memory(example), "the training")
-  # The newest ones, the best one, and the one being written. A resumed run has most.
-  kept = 1 if saved else config.keep_checkpoints + 2
-  size = count * leaves.nbytes(example)
-  if warning := run_folder.check_disk(run_dir, size, kept=kept):
+  if warning := run_folder.check_disk(run_dir, *disk_bytes(config, example, saved)):
     _print_line(warning)
   # Compile while the state is being made or read, which also compiles: XLA keeps a
   # second core busy that way.
@@ -211,10 +242,17 @@ def _start(
   iteration = background.submit(compile_iteration, config, env, agent, example)
   background.shutdown(wait=False)
   if fill is None:
-    state = restore(config, run_dir, example, _print_line)
-    return Start(env, agent, iteration, path, state, int(state.env_steps))
+    state, intact = restore_run(
+      config,
+      run_dir,
+      example,
+      _print_line,
+      refill=lambda: initial_expert(config, env, _expert(config)),
+    )
+    return Start(env, agent, iteration, path, state, int(state.env_steps), intact)
   _print_line("filling the expert replay")
   state = initial_state(config, env, agent, fill)
+  state = initial_weights.put(weights, state) if weights else state
   devices.release_memory()
   if state.expert_replay is not None:
     solved, ended = map(int, replay.episodes(state.expert_replay))
@@ -223,7 +261,14 @@ def _start(
     _print_line("the run has no checkpoint yet and starts from the beginning")
     return Start(env, agent, iteration, path, state, 0)
   devices.run_on_primary(
-    lambda: run_folder.create(run_dir, config, overwrite=overwrite, devices=count)
+    lambda: run_folder.create(
+      run_dir,
+      config,
+      overwrite=overwrite,
+      devices=count,
+      origin=weights and weights.origin,
+      write_more=weights and weights.write,
+    )
   )
   path = run_folder.open_run(run_dir).path
   return Start(env, agent, iteration, path, state, None)
@@ -243,7 +288,7 @@ def _expert(config: TrainConfig) -> ExpertReplayMaker:
   demos = demonstrations.load(path, task, config.env, allow_unsolved=allow)
   slots = config.replay.expert_steps
   _print_line(f"expert replay: {demos.instants} instants of {path} fill {slots} slots")
-  return lambda config, env, _: expert.replay_from_demonstrations(demos, config, env)
+  return functools.partial(expert.replay_from_demonstrations, demos)
 
 
 def _loop(config, start, iteration, reporter, saver, signals) -> TrainState:

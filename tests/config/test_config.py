@@ -219,14 +219,6 @@ def test_a_replay_must_hold_the_window_of_an_lstm():
     validate(replaced(config, ["agent", "lstm_instants"], 5))
 
 
-def test_demonstrations_exclude_randomized_worlds():
-  config = TrainConfig(
-    env=EnvConfig(randomize=True), replay=ReplayConfig(demonstrations="mine.npz")
-  )
-  with pytest.raises(ConfigError, match="cannot be used with env.randomize"):
-    validate(config)
-
-
 def test_a_command_must_take_effect_before_the_next_one():
   env = EnvConfig(randomize=True, randomization=RandomizationConfig(delay_s=0.15))
   with pytest.raises(ConfigError, match="delay_s=0.15 must be below.*=0.15"):

@@ -117,6 +117,40 @@ def test_the_replay_is_what_the_worlds_showed(demos, env):
       state = step(state, action, jax.random.key(t))
 
 
+def test_randomized_episodes_differ_in_what_is_seen_alone(demos):
+  """Each draws its colors and cameras once, also where the file repeats."""
+  images = {"obs": "pixels", "global_size": (12, 16), "wrist_size": (8, 8)}
+  plain = dataclasses.replace(CONFIG, env=dataclasses.replace(ENV, **images))
+  replay = dataclasses.replace(CONFIG.replay, expert_steps=96)
+  plain = dataclasses.replace(plain, replay=replay)
+  wild = dataclasses.replace(plain, env=dataclasses.replace(plain.env, randomize=True))
+  both = [
+    expert.replay_from_demonstrations(demos, config, make_env(config.env)).slots
+    for config in (plain, wild)
+  ]
+  (one, other), images = both, ["global_image", "wrist_image"]
+  for name in ("reward", "terminated", "truncated", "primitives"):
+    np.testing.assert_allclose(
+      getattr(one.timestep, name), getattr(other.timestep, name), atol=1e-5
+    )
+  np.testing.assert_array_equal(one.action, other.action)
+  for name in ("robot", "tool"):
+    x, y = (getattr(slots.timestep.observation, name) for slots in both)
+    np.testing.assert_allclose(x, y, atol=1e-5)
+  seen = np.asarray(other.timestep.observation.global_image, np.float32)
+  # The mean color is about that of the slot before, unless an episode begins.
+  color = seen.mean((2, 3))
+  change = np.abs(np.diff(color, axis=0)).max(-1)
+  index = np.resize(np.arange(demos.instants), (4, 24)).T
+  begins = demos.first[index][1:]
+  assert begins.sum() > 8
+  assert np.median(change[begins]) > 5 * np.median(change[~begins])
+  # The same episode, drawn twice.
+  assert index[0, 0] == index[18, 1] and demos.first[index[0, 0]]
+  assert np.abs(color[0, 0] - color[18, 1]).max() > 2
+  assert (np.asarray(one.timestep.observation.global_image) != seen).any()
+
+
 def test_another_file_needs_no_other_program(demos, env, tmp_path):
   """Two files of different lengths, converted with an empty compilation cache."""
   names = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"

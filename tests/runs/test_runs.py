@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import dataclasses
 import json
 import os
@@ -11,13 +12,15 @@ import shutil
 import subprocess
 import sys
 import time
+from typing import Any
 
 import pytest
 
+from apnpql_jax.config import changes, codec
 from apnpql_jax.config.files import config_to_json
 from apnpql_jax.config.schema import AgentConfig, TrainConfig
-from apnpql_jax.errors import UserError
-from apnpql_jax.runs import run_folder
+from apnpql_jax.errors import ConfigError, UserError
+from apnpql_jax.runs import provenance, run_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -107,19 +110,49 @@ def test_configuration_that_is_not_text_is_refused(tmp_path):
     run_folder.load_run_config(tmp_path / "a")
 
 
-def test_resume_may_change_only_what_does_not_alter_learning(tmp_path):
-  run = write_run(tmp_path / "a")
-  for name in run_folder.MAY_CHANGE:
-    value = getattr(TrainConfig(), name)
-    others = {bool: lambda x: not x, int: lambda x: x + 1, tuple: lambda x: (*x, "a")}
-    others[str] = lambda x: "mean"
-    other = others[type(value)](value)
-    run_folder.check_resumable(run, dataclasses.replace(TrainConfig(), **{name: other}))
-  fixed = {f.name for f in dataclasses.fields(TrainConfig)} - set(run_folder.MAY_CHANGE)
-  for name in fixed - {"env", "agent", "replay"}:
-    changed = {name: getattr(TrainConfig(), name) + 1}
-    with pytest.raises(UserError, match=name):
-      run_folder.check_resumable(run, dataclasses.replace(TrainConfig(), **changed))
+def changed(config: Any, name: str) -> Any:
+  """Returns the configuration with another value of the setting ``name``."""
+  name, _, rest = name.partition(".")
+  value = getattr(config, name)
+  kinds: dict[type, Callable[[Any], Any]] = {
+    bool: lambda x: not x,
+    int: lambda x: x + 1,
+    float: lambda x: x + 0.01,
+    str: lambda x: x + "a",
+    tuple: lambda x: (*x, 1),
+  }
+  value = changed(value, rest) if rest else kinds[type(value)](value)
+  return dataclasses.replace(config, **{name: value})
+
+
+def test_resume_changes_only_declared_settings(tmp_path):
+  run, names = write_run(tmp_path / "a"), dict(codec.flatten(TrainConfig()))
+  assert names.keys() >= {*changes.MAY_CHANGE, *changes.OF_WEIGHTS}
+  for name in names:
+    other = changed(TrainConfig(), name)
+    if name in changes.MAY_CHANGE:
+      run_folder.check_resumable(run, other)
+      continue
+    with pytest.raises(ConfigError, match=f"{name} .*start a new run") as error:
+      run_folder.check_resumable(run, other)
+    assert ("--init-from" in str(error.value)) == (name not in changes.OF_WEIGHTS)
+
+
+def test_settings_that_change_at_a_resume_are_recorded(tmp_path):
+  config = TrainConfig(seed=3)
+  run = run_folder.create(tmp_path / "run", config).path
+  assert run_folder.change(run, config, step=16) == ""
+  assert "changes" not in (provenance.read(run) or {})
+  for step, name in (16, "agent.epsilon"), (32, "total_steps"):
+    config = changed(config, name)
+    assert run_folder.change(run, config, step=step).startswith(name)
+    assert run_folder.load_run_config(run) == config
+  found = (provenance.read(run) or {})["changes"]
+  assert [(x["step"], x["settings"]) for x in found] == [
+    (16, {"agent.epsilon": [1.0, 1.01]}),
+    (32, {"total_steps": [200_000, 200_001]}),
+  ]
+  assert provenance.changed_versions(run) == []
 
 
 def test_a_run_in_training_is_not_replaced(tmp_path):
@@ -152,11 +185,11 @@ def test_a_run_in_training_is_not_replaced(tmp_path):
 def test_a_disk_without_room_for_a_checkpoint_is_refused(tmp_path):
   free = shutil.disk_usage(tmp_path).free
   run = tmp_path / "deep" / "run"
-  assert run_folder.check_disk(run, free // 100, kept=3) == ""
-  warning = run_folder.check_disk(run, free // 2, kept=3)
-  assert "3 checkpoints need up to" in warning and "keep_checkpoints" in warning
+  assert run_folder.check_disk(run, free // 100, free // 50) == ""
+  warning = run_folder.check_disk(run, free // 2, 2 * free)
+  assert "checkpoints that are kept need" in warning and "keep_checkpoints" in warning
   with pytest.raises(UserError, match="a checkpoint needs up to .* replay.capacity"):
-    run_folder.check_disk(run, 2 * free, kept=1)
+    run_folder.check_disk(run, 2 * free, 3 * free)
 
 
 def test_only_a_run_can_be_overwritten(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import operator
 from pathlib import Path
 import resource
 import shutil
@@ -218,6 +219,33 @@ def test_the_checkpoint_before_replaces_one_whose_segment_is_damaged(tmp_path):
   assert restored(tmp_path) == (6, bits(6))
   shutil.rmtree(folder)
   assert restored(tmp_path) == (6, bits(6))
+
+
+@pytest.mark.parametrize("ring", ["agent", "expert"])
+def test_a_segment_of_all_checkpoints_costs_only_what_was_in_it(tmp_path, ring):
+  training = Training(LENGTH)
+  with writer_of(tmp_path) as writer:
+    training.save(writer)
+    training.play(writer)
+    training.save(writer)
+  newest = checkpoint_record.read(tmp_path, LENGTH + CHUNK).segments
+  (bad,) = (x for x in newest if x.ring == ring and x.start == ROWS)
+  shutil.rmtree(tmp_path / "segments" / str(bad.number))
+  example = jax.eval_shape(lambda: Training().items)
+  with pytest.raises(UserError, match="24 of .*26 of|26 of .*24 of"):
+    checkpoint_reader.restore(tmp_path, None, example)
+  found = checkpoint_reader.restore(tmp_path, None, example, without_segments=True)
+  assert found.step == LENGTH + CHUNK and found.lost == [bad]
+  assert found.damaged == []
+  expected, got = training.items, found.items
+  for name, array in expected["replay"][ring].items():
+    if name != "marks":
+      array = array.at[bad.start : bad.stop].set(0)
+      np.testing.assert_array_equal(got["replay"][ring][name], array)
+  other = {"agent": "expert", "expert": "agent"}[ring]
+  for part in ("learner",), ("replay", other):
+    both = [functools.reduce(operator.getitem, part, x) for x in (expected, got)]
+    assert leaves.checksums(both[0]) == leaves.checksums(both[1])
 
 
 def test_segments_of_checkpoints_set_aside_are_kept(tmp_path):

@@ -34,6 +34,32 @@ main.main(["list"])
 """
 
 
+BUILDING = """
+import contextlib, pathlib, sys, time
+from apnpql_jax.runs import run_folder
+from apnpql_jax.runs.signals import Signals
+root, work = pathlib.Path(sys.argv[1]), sys.argv[2]
+with Signals("nothing is saved"), run_folder.new_run_dir("a", root) as run:
+  with run_folder.reserve(root / "b"):
+    if work == "made":
+      (run / "config.json").write_text("{}")
+    print("ready", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize(("work", "left"), [("none", []), ("made", ["a-1"])])
+def test_a_process_that_ends_at_once_leaves_no_empty_run_folder(tmp_path, work, left):
+  command = [sys.executable, "-c", BUILDING, str(tmp_path), work]
+  with subprocess.Popen(
+    command, cwd=Path(__file__).parents[2], stdout=subprocess.PIPE, text=True
+  ) as process:
+    assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    process.send_signal(signal.SIGINT)
+    assert process.wait(10) == 128 + signal.SIGINT
+  assert [path.name for path in tmp_path.iterdir()] == left
+
+
 def _busy(phase: str) -> subprocess.Popen[str]:
   process = subprocess.Popen(
     [sys.executable, "-c", BUSY, phase],

@@ -149,3 +149,20 @@ def test_a_free_body_must_not_fall_out_of_the_world(tmp_path, text, falls):
     ConfigError, match=f"mine.xml: nothing holds up body '{falls}': li"
   ):
     scene_checks.check_support(scene.model, scene.name)
+
+
+def test_what_mujoco_says_of_a_file_is_one_line_with_the_element(tmp_path, capsys):
+  twice = '<worldbody><geom name="table" size="0.1"/></worldbody>'
+  words = "mine.xml does not compile: .*repeated name 'table' in geom.* line [0-9]+"
+  with pytest.raises(ConfigError, match=words) as error:
+    load(tmp_path, f"<mujoco>{INCLUDE}{twice}</mujoco>")
+  assert "\n" not in str(error.value)
+  with pytest.raises(ConfigError, match="mine.xml does not compile: .* Line number=1"):
+    load(tmp_path, "no XML")
+  # A warning of several lines, with the path of this package.
+  cloth = """<worldbody><body name="c"><flexcomp name="cloth" type="grid" mass="0.1"
+    count="3 3 1" spacing="0.1 0.1 0.1" dim="2"/></body></worldbody>"""
+  with pytest.raises(ConfigError, match="Flex not implemented"):
+    load(tmp_path, f"<mujoco>{INCLUDE}{cloth}</mujoco>")
+  (line,) = capsys.readouterr().err.splitlines()
+  assert line.startswith("mine.xml: flex 'cloth' is not rigid")

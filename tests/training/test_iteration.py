@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import dataclasses
 from pathlib import Path
+import shutil
 from typing import Any, NamedTuple
 
 import jax
@@ -23,18 +24,19 @@ from apnpql_jax.cli import main
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.data import replay
 from apnpql_jax.envs.env import Env, make_env
-from apnpql_jax.errors import UserError
+from apnpql_jax.errors import FileError, UserError
 from apnpql_jax.runs import (
   checkpoint_reader,
   checkpoint_record,
   leaves,
   run_folder,
+  segments,
 )
 from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
 from apnpql_jax.training import resume, skipped_updates
 from apnpql_jax.training.expert import collect_expert, empty_expert
 from apnpql_jax.training.iteration import make_iteration, make_sample
-from apnpql_jax.training.state import TrainState, initial_state
+from apnpql_jax.training.state import TrainState, initial_expert, initial_state
 
 WORLDS, LENGTH = testing.TINY.env.worlds, testing.TINY.rollout_length
 
@@ -231,6 +233,77 @@ def test_a_state_saved_without_replay_continues_with_an_older_one(
   assert held[newest].all() and not kept[newest].any()
   np.testing.assert_array_equal(held[:newest], kept[:newest])
   assert jnp.isfinite(iteration(restored)[1]["loss/q"])
+
+
+def _damage(run: Path, state: TrainState, ring: str, start: int) -> None:
+  """Removes the segment of a ring that begins at time index ``start``."""
+  record = checkpoint_record.read(run, int(state.env_steps))
+  (found,) = (x for x in record.segments if (x.ring, x.start) == (ring, start))
+  shutil.rmtree(segments.folder(run) / str(found.number))
+
+
+def test_slots_of_a_damaged_segment_are_never_drawn(
+  built, iteration, tmp_path, monkeypatch
+):
+  ring = built.state.replay.slots
+  rows = sum(x.nbytes for x in jax.tree.leaves(ring)) // len(ring.action)
+  monkeypatch.setattr(segments, "PART_BYTES", 2 * rows)
+  _save(tmp_path, built, (built.state, True))
+  for name in ("agent", "expert"):
+    _damage(tmp_path, built.state, name, 2)
+  example = jax.eval_shape(lambda: jax.tree.map(jnp.copy, built.state))
+  warnings: list[str] = []
+  restored, intact = resume.restore_run(
+    built.config, tmp_path, example, warnings.append
+  )
+  assert not intact and warnings == [
+    "8 slots of the replay are damaged and left out",
+    "8 slots of the expert replay are damaged and left out",
+  ]
+  for held, kept in (
+    (restored.replay, built.state.replay),
+    (restored.expert_replay, built.state.expert_replay),
+  ):
+    assert held is not None and kept is not None
+    gone = held.slots.timestep.truncated & ~kept.slots.timestep.truncated
+    np.testing.assert_array_equal(np.flatnonzero(gone.any(1)), [1, 2, 3])
+    # What is lost is zeros; nothing of it is in any transition.
+    assert not held.slots.action[2:4].any() and kept.slots.action[2:4].any()
+    batch = replay.sample(held, jax.random.key(0), batch_size=512, n_step=2, gamma=0.9)
+    assert 0 < batch.weight.sum() and batch.primitives_tm1[:, 0].any(1).all()
+    assert batch.observation_t.robot.any(1).all()
+  assert jnp.isfinite(iteration(restored)[1]["loss/q"])
+  # The next checkpoint is whole.
+  rings = resume.to_rings(restored, chunk=LENGTH)
+  with CheckpointWriter(tmp_path, built.config, keep=9) as writer:
+    later = restored.replace(env_steps=restored.env_steps + 1)
+    writer.save(int(later.env_steps), resume.to_items(later, whole=True), rings=rings)
+  again = resume.restore_run(built.config, tmp_path, example, pytest.fail)
+  assert again.intact and _bits(again.state) == _bits(later)
+
+
+def test_a_damaged_expert_replay_is_filled_again(built, tmp_path):
+  """It is the same, because it depends on the seed alone."""
+  _save(tmp_path, built, (built.state, True))
+  _damage(tmp_path, built.state, "expert", 0)
+  example = jax.eval_shape(lambda: jax.tree.map(jnp.copy, built.state))
+  warnings: list[str] = []
+  restored, intact = resume.restore_run(
+    built.config,
+    tmp_path,
+    example,
+    warnings.append,
+    refill=lambda: initial_expert(built.config, built.env, collect_expert),
+  )
+  assert not intact and warnings == ["the expert replay is damaged and filled again"]
+  assert _bits(restored) == _bits(built.state)
+
+  def gone() -> None:
+    raise FileError("demos.npz is gone")
+
+  words = r"expert replay is damaged .*\(demos.npz is gone\); nothing of it is left"
+  with pytest.raises(FileError, match=words):
+    resume.restore_run(built.config, tmp_path, example, warnings.append, refill=gone)
 
 
 @pytest.mark.parametrize(
