@@ -50,7 +50,7 @@ def base_config(args: Train) -> TrainConfig:
 
 def train(args: Train) -> Json:
   """Trains or resumes a run and returns its summary."""
-  config, resume = _with_shortcuts(args), args.resume is not None
+  config, resume = with_shortcuts(args), args.resume is not None
   with contextlib.ExitStack() as stack:
     run_dir = args.resume or args.run
     if run_dir is None:
@@ -190,7 +190,7 @@ def list_names(args: List) -> Json:
   }
 
 
-def _with_shortcuts(args: Train) -> TrainConfig:
+def with_shortcuts(args: Train) -> TrainConfig:
   """Returns the settings with --backend, --obs and --algorithm applied."""
 
   def updated(part: Any, **settings: str | None) -> Any:
