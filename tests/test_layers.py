@@ -20,8 +20,8 @@ STAIR = (
 APART = {
   "agents": {"sim", "render", "tasks", "primitives", "randomization", "envs"},
   "data": {"agents", "render", "randomization", "envs"},
-  "reports": {"agents", "sim", "render", "tasks", "envs", "data", "devices"},
-  "sweeps": {"agents", "sim", "render", "tasks", "envs", "data", "devices"},
+  "reports": {"agents", "sim", "render", "tasks", "envs", "data"},
+  "sweeps": {"agents", "sim", "render", "tasks", "envs", "data"},
   "runs": {"agents", "sim", "render", "tasks", "envs", "data"},
   "render": {"sim", "tasks"},
 }

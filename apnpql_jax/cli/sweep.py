@@ -6,26 +6,20 @@ from collections.abc import Sequence
 import contextlib
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from apnpql_jax import errors
 from apnpql_jax.cli import commands
 from apnpql_jax.cli.options import Command, Count, File, Train, parse
 from apnpql_jax.config import files
 from apnpql_jax.config.checks import validate
 from apnpql_jax.config.schema import TrainConfig
-from apnpql_jax.console import print_line
-from apnpql_jax.errors import ConfigError, RunStopped, UserError
+from apnpql_jax.errors import ConfigError, UserError
 from apnpql_jax.runs import run_folder
-from apnpql_jax.runs.signals import Signals
 from apnpql_jax.sweeps import manifest as states
 from apnpql_jax.sweeps.manifest import Manifest
 from apnpql_jax.sweeps.plan import Planned, make_plan
-
-if TYPE_CHECKING:
-  from apnpql_jax.sweeps.display import SweepDisplay
 
 _ROOT = Path("runs")
 
@@ -92,36 +86,16 @@ def parse_sweep(argv: Sequence[str]) -> Sweep:
 
 def sweep(args: Sweep) -> dict[str, Any]:
   """Trains the runs that are not done; returns the states of all."""
-  from apnpql_jax.sweeps.display import SweepDisplay
-  from apnpql_jax.sweeps.runner import Runner
+  from apnpql_jax.sweeps import training
 
   if args.jobs is not None and args.jobs < 1:
     raise ConfigError(f"--jobs {args.jobs} must be at least 1")
   with contextlib.ExitStack() as stack:
     manifest = _open(args, stack)
-    launcher = _launcher(args, manifest)
-    hint = f"to continue: apnpql sweep --resume {args.resume or _shown(manifest)}"
-    print_line(f"sweep folder {manifest.folder}; {len(manifest.runs)} runs")
-    signals = stack.enter_context(Signals("interrupted"))
-    signals.finish_first(f"stopped at once; runs save by themselves; {hint}")
-    display = stack.enter_context(SweepDisplay(manifest))
-    Runner(manifest, launcher, display.report).run(signals.caught, display.show)
-    _summarize(manifest, display)
-  counts = {
-    state: sum(entry.state == state for entry in manifest.runs)
-    for state in (states.DONE, states.FAILED, states.STOPPED, states.WAITING)
-  }
-  if signals.caught:
-    code = errors.INTERRUPTED + signals.caught[0]
-    done = f"stopped; {counts[states.DONE]} of {len(manifest.runs)} runs are done"
-    raise RunStopped(f"{done}; {hint}", code)
-  if failed := [entry.name for entry in manifest.runs if entry.state != states.DONE]:
-    raise RunStopped(
-      f"{len(failed)} of {len(manifest.runs)} runs failed; {hint}", errors.FAILED
-    )
+    training.train(manifest, _launcher(args, manifest))
+  folder = str(training.shown(manifest.folder))
   runs = {entry.name: entry.state for entry in manifest.runs}
-  result = {"sweep": str(manifest.folder), **counts}
-  return {**result, "runs": runs} if args.json else result
+  return {"sweep": folder, "runs": runs if args.json else len(runs)}
 
 
 def config_of(argv: Sequence[str]) -> TrainConfig:
@@ -152,17 +126,7 @@ def _open(args: Sweep, stack: contextlib.ExitStack) -> Manifest:
   if folder is None:
     name = f"{'-'.join(args.presets)}-sweep"
     folder = stack.enter_context(run_folder.new_run_dir(name, _ROOT))
-  if (folder / states.MANIFEST_FILE).exists():
-    manifest = states.load(folder)
-  else:
-    if folder.exists() and any(folder.iterdir()):
-      raise ConfigError(
-        f"{str(folder)!r} holds files of something else; choose another"
-      )
-    folder.mkdir(parents=True, exist_ok=True)
-    manifest = Manifest(folder.absolute(), [])
-  manifest.add(plan)
-  return manifest
+  return states.open_folder(folder, plan)
 
 
 def _check(run: Planned) -> None:
@@ -191,24 +155,3 @@ def _launcher(args: Sweep, manifest: Manifest) -> Any:
     settings=parse_settings(args.slurm),
     cluster="slurm" if args.launcher == "slurm" else "local",
   )
-
-
-def _shown(manifest: Manifest) -> Path:
-  """Returns the folder as the user would write it."""
-  here = Path.cwd()
-  inside = manifest.folder.is_relative_to(here)
-  return manifest.folder.relative_to(here) if inside else manifest.folder
-
-
-def _summarize(manifest: Manifest, display: SweepDisplay) -> None:
-  """Shows the groups of the runs so far, and how to see more."""
-  from apnpql_jax.console import reporting
-  from apnpql_jax.reports import groups, reading, tables
-
-  with reporting("summarize the sweep"):
-    folders = map(manifest.run_dir, manifest.runs)
-    begun = [x for x in folders if (x / run_folder.CONFIG_FILE).is_file()]
-    if begun:
-      found = groups.group(reading.find(begun))
-      display.table(tables.brief(found))
-      print_line(f"report: apnpql compare {_shown(manifest)} --html report.html")

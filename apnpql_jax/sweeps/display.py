@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+import os
 import sys
 import time
 from typing import Any, TextIO
@@ -16,6 +17,8 @@ from apnpql_jax.sweeps.manifest import Entry, Manifest
 
 _ORDER = (states.RUNNING, states.FAILED, states.STOPPED, states.WAITING, states.DONE)
 """States from the most to the least interesting."""
+
+_WIDE = 60  # columns of a terminal with room for all columns of the table
 
 _STYLE = {
   states.RUNNING: "cyan",
@@ -115,11 +118,21 @@ class SweepDisplay:
     from rich import box
     from rich.table import Table
 
-    table = Table(box=box.SIMPLE_HEAD, caption=self._counts(), caption_justify="left")
-    table.add_column("run", overflow="ellipsis", no_wrap=True, min_width=8)
-    table.add_column("state", no_wrap=True)
-    for name in ("steps", "solved", "min", "left"):
-      table.add_column(name, justify="right", no_wrap=True)
+    table = Table(
+      box=box.SIMPLE_HEAD,
+      pad_edge=False,
+      caption=self._counts(),
+      caption_justify="left",
+    )
+    table.add_column("run", overflow="ellipsis", no_wrap=True)
+    table.add_column("state", no_wrap=True, min_width=7)
+    columns = ["steps", "solved", "min", "left"]
+    columns = columns if self._console.width >= _WIDE else columns[:2]
+    for name in columns:
+      table.add_column(name, justify="right", no_wrap=True, min_width=len(name))
+    # What all names begin with, such as the preset, is left out.
+    shared = os.path.commonprefix([entry.name for entry in self._manifest.runs])
+    cut = shared.rfind("-") + 1 if len(self._manifest.runs) > 1 else 0
     room = max(3, self._console.height - 7)
     for entry in sorted(self._manifest.runs, key=lambda x: _ORDER.index(x.state))[
       :room
@@ -127,13 +140,12 @@ class SweepDisplay:
       follower = self._followers[entry.name]
       begun = follower.step > 0
       solved, left = follower.success, follower.left_s
-      table.add_row(
-        entry.name,
-        entry.state,
+      cells = [
         f"{100 * follower.share:.0f} %" if begun else "",
         "" if solved is None else f"{100 * solved:.0f} %",
         f"{follower.seconds / 60:.1f}" if begun else "",
         f"{left / 60:.1f}" if left and entry.state == states.RUNNING else "",
-        style=_STYLE.get(entry.state, "dim"),
-      )
+      ][: len(columns)]
+      style = _STYLE.get(entry.state, "dim")
+      table.add_row(entry.name[cut:], entry.state, *cells, style=style)
     return table

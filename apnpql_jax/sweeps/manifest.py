@@ -120,6 +120,22 @@ def load(folder: Path) -> Manifest:
   return Manifest(folder.absolute(), runs)
 
 
+def open_folder(folder: Path, plan: Sequence[Planned]) -> Manifest:
+  """Returns the sweep in a folder with the runs of a plan added; writes nothing.
+
+  Raises:
+    ConfigError: The folder holds something else, or a run with other options.
+  """
+  if (folder / MANIFEST_FILE).exists():
+    manifest = load(folder)
+  elif folder.exists() and any(folder.iterdir()):
+    raise ConfigError(f"{str(folder)!r} holds something else; choose another --out")
+  else:
+    manifest = Manifest(folder.absolute(), [])
+  manifest.add(plan)
+  return manifest
+
+
 def find_equal(root: Path, plan: Sequence[Planned]) -> Path | None:
   """Returns the newest sweep folder in ``root`` that has exactly this plan, if any."""
   wanted = [(run.name, run.argv) for run in plan]

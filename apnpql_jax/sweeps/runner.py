@@ -32,6 +32,7 @@ class Runner:
       caught: Signals so far; after the first, the runs save and no other starts.
       show: Called in every turn, to show the progress.
     """
+    self._manifest.folder.mkdir(parents=True, exist_ok=True)
     with run_folder.lock(self._manifest.folder):
       self._manifest.refresh()
       self._manifest.save()

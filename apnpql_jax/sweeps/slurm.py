@@ -6,8 +6,10 @@ All nodes and the machine that starts the sweep share its folder.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import contextlib
 import os
 from pathlib import Path
+import shutil
 import signal
 import subprocess
 from typing import Any
@@ -17,6 +19,9 @@ from apnpql_jax.sweeps.launcher import Job, Work
 
 ALL_AT_ONCE = 1_000_000
 """Jobs at the same time, unless the user limits them: the cluster decides."""
+
+DEFAULTS = {"name": "apnpql", "timeout_min": 24 * 60}
+"""Settings of the jobs unless the user gives others; submitit's limit is minutes."""
 
 _LOST = 1  # exit code of a job that ended without one
 
@@ -50,7 +55,9 @@ class Task:
 
     self._stop()
     if self._process is not None:
-      self._process.wait()
+      # This runs inside of ``wait`` above, which holds a lock of ``Popen``.
+      with contextlib.suppress(ChildProcessError):
+        os.waitid(os.P_PID, self._process.pid, os.WEXITED | os.WNOWAIT)
     return DelayedSubmission(Task(), work)
 
   def _stop(self) -> None:
@@ -117,10 +124,15 @@ class SlurmLauncher:
       raise ConfigError(
         "--launcher slurm needs submitit: pip install 'apnpql-jax[sweep]'"
       ) from None
+    if cluster == "slurm" and shutil.which("sbatch") is None:
+      raise ConfigError(
+        "--launcher slurm needs sbatch; run it on a machine of the cluster, or try "
+        "--launcher slurm-local"
+      )
     self.jobs, self._cluster = jobs, cluster
     try:
       self._executor = submitit.AutoExecutor(folder, cluster=cluster)
-      self._executor.update_parameters(**{"name": "apnpql", **(settings or {})})
+      self._executor.update_parameters(**(DEFAULTS | dict(settings or {})))
     except (RuntimeError, ValueError, NameError, AssertionError) as error:
       raise ConfigError(f"--launcher slurm: {one_line(error)}") from None
 
