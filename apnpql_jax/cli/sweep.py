@@ -72,7 +72,8 @@ class Sweep(Command):
 
 def parse_sweep(argv: Sequence[str]) -> Sweep:
   """Returns the options of a sweep; those it does not have itself are in ``train``."""
-  own = {f"--{x.name}" for x in dataclasses.fields(Sweep)} | {"-h", "--help"}
+  names = [x.name for x in dataclasses.fields(Sweep) if x.name != "train"]
+  own = {*(f"--{name}" for name in names), "-h", "--help"}
   mine: list[str] = []
   others: list[str] = []
   chosen = mine

@@ -48,6 +48,7 @@ _PAGE = string.Template("""<!doctype html>
            overflow-wrap: break-word; }
   th { background: #f5f7f9; } tr:last-child td { border-bottom: 0; }
   td.short, th:first-child { white-space: nowrap; }
+  td:not(.short) { min-width: 11rem; }
   tr.differs td { background: #fff6dd; }
   .key { display: flex; flex-wrap: wrap; gap: .2rem 1.1rem; margin: .5rem 0; }
   .key i { display: inline-block; width: 1.1em; height: .28em; margin-right: .4em;
