@@ -75,8 +75,16 @@ def test_options_that_the_sweep_does_not_have_are_those_of_train():
 PLAN = make_plan(["push_plate"], ["agent.epsilon=0.5,1"])
 
 
+def stored(folder: Path) -> Manifest:
+  """Writes the manifest of ``PLAN`` to a new folder."""
+  made = open_folder(folder, PLAN)
+  folder.mkdir(exist_ok=True)
+  made.save()
+  return made
+
+
 def test_a_manifest_is_read_as_it_was_written(tmp_path):
-  made = open_folder(tmp_path / "sweep", PLAN)
+  made = stored(tmp_path / "sweep")
   made.runs[1].state, made.runs[1].line = states.FAILED, "apnpql: no"
   made.save()
   assert load(tmp_path / "sweep") == made
@@ -97,7 +105,7 @@ def test_what_is_done_is_read_from_the_run_folders(tmp_path):
 
 
 def test_the_same_plan_finds_its_sweep_and_a_larger_one_can_be_added(tmp_path):
-  open_folder(tmp_path / "sweep", PLAN).save()
+  stored(tmp_path / "sweep")
   (tmp_path / "other").mkdir()
   (tmp_path / "other" / states.MANIFEST_FILE).write_text("{")
   assert find_equal(tmp_path, PLAN) == tmp_path / "sweep"
@@ -108,7 +116,7 @@ def test_the_same_plan_finds_its_sweep_and_a_larger_one_can_be_added(tmp_path):
 
 
 def test_a_run_with_other_options_is_not_taken_for_the_same(tmp_path):
-  open_folder(tmp_path / "sweep", PLAN).save()
+  stored(tmp_path / "sweep")
   other = make_plan(["push_plate"], ["agent.epsilon=0.5,1"], options=["--obs", "state"])
   with pytest.raises(ConfigError, match="with other options: apnpql train push_plate"):
     open_folder(tmp_path / "sweep", other)
@@ -133,7 +141,7 @@ def test_a_folder_with_other_files_is_refused(tmp_path):
   ],
 )
 def test_a_foreign_manifest_is_refused_in_one_line(change, tmp_path: Path):
-  open_folder(tmp_path, PLAN).save()
+  stored(tmp_path)
   path = tmp_path / states.MANIFEST_FILE
   data = json.loads(path.read_text())
   change(data)
