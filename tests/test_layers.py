@@ -12,13 +12,16 @@ NAME = PACKAGE.name
 
 STAIR = (
   "errors types atomic console runtime dists config devices sim render tasks "
-  "randomization primitives envs agents data runs training testing cli __main__"
+  "randomization primitives envs agents data runs reports sweeps training testing cli "
+  "__main__"
 ).split()
 """Rooms from the bottom up: each imports only from itself and from earlier ones."""
 
 APART = {
   "agents": {"sim", "render", "tasks", "primitives", "randomization", "envs"},
   "data": {"agents", "render", "randomization", "envs"},
+  "reports": {"agents", "sim", "render", "tasks", "envs", "data"},
+  "sweeps": {"agents", "sim", "render", "tasks", "envs", "data"},
   "runs": {"agents", "sim", "render", "tasks", "envs", "data"},
   "render": {"sim", "tasks"},
 }

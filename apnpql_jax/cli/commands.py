@@ -52,7 +52,7 @@ def base_config(args: Train) -> TrainConfig:
 
 def train(args: Train) -> Json:
   """Trains or resumes a run and returns its summary."""
-  config, resume = _with_shortcuts(args), args.resume is not None
+  config, resume = with_shortcuts(args), args.resume is not None
   if args.init_from is not None:
     run_folder.split_origin(args.init_from)
   with contextlib.ExitStack() as stack:
@@ -195,7 +195,7 @@ def list_names(args: List) -> Json:
   }
 
 
-def _with_shortcuts(args: Train) -> TrainConfig:
+def with_shortcuts(args: Train) -> TrainConfig:
   """Returns the settings with --backend, --obs and --algorithm applied."""
 
   def updated(part: Any, **settings: str | None) -> Any:

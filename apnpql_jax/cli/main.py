@@ -14,7 +14,10 @@ from typing import Any
 from apnpql_jax import __version__, errors, runtime
 from apnpql_jax.cli import commands, options
 from apnpql_jax.cli.commands import Json
+from apnpql_jax.cli.compare import Compare, compare
 from apnpql_jax.cli.options import Train, parse
+from apnpql_jax.cli.plot import Plot, plot
+from apnpql_jax.cli.sweep import Sweep, parse_sweep, sweep
 from apnpql_jax.config import files
 from apnpql_jax.console import Unfailing, print_line, reporting
 from apnpql_jax.errors import ConfigError, UserError, check_name
@@ -39,9 +42,10 @@ def main(argv: Sequence[str] | None = None) -> int:
       _print(__version__)
       return 0
     check_name("command", args[0], list(_COMMANDS))
-    runtime.configure()
-    runtime.collect_garbage_less_often()
     kind, command = _COMMANDS[args[0]]
+    if kind.uses_jax:
+      runtime.configure()
+      runtime.collect_garbage_less_often()
     parsed = _parse(kind, args)
     with Signals("interrupted"), _json_only(parsed.json) as write:
       result = command(parsed)
@@ -74,6 +78,8 @@ def _fill_closed_streams() -> None:
 def _parse(kind: type[Any], args: Sequence[str]) -> Any:
   """Returns the options of a command; those of ``train`` override its preset or run."""
   name, *rest = args
+  if kind is Sweep:
+    return parse_sweep(rest)
   if kind is not Train:
     return parse(kind, name, rest)
   # Parsing ends here for --help, which shows the settings of a preset named before it.
@@ -129,7 +135,9 @@ def _plain(value: Any) -> Any:
 
 
 def _show(result: Json) -> str:
-  """Returns the result as one line per entry, for people."""
+  """Returns the result as one line per entry, for people, or its ``text``."""
+  if "text" in result:
+    return result["text"].rstrip()
   rows = dict(_rows(result))
   width = max(map(len, rows))
   return "\n".join(f"{name:<{width}}  {_text(x)}" for name, x in rows.items())
@@ -174,5 +182,8 @@ _COMMANDS: dict[str, tuple[type[Any], Callable[[Any], Json]]] = {
   "collect": (options.Collect, commands.collect),
   "convert": (options.Convert, commands.convert),
   "repeat": (options.Repeat, commands.repeat),
+  "sweep": (Sweep, sweep),
+  "plot": (Plot, plot),
+  "compare": (Compare, compare),
   "list": (options.List, commands.list_names),
 }

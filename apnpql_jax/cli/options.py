@@ -8,7 +8,7 @@ import dataclasses
 import io
 from pathlib import Path
 import re
-from typing import Annotated, TypeVar
+from typing import Annotated, ClassVar, TypeVar
 
 import tyro
 
@@ -22,35 +22,40 @@ def _default_hint(text: str) -> object:
   return tyro.conf.arg(help_behavior_hint=text)
 
 
-_Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 _OfPreset = Annotated[str | None, _default_hint("(default: as in the preset)")]
-_Count = Annotated[int | None, _default_hint("")]
-_File = Annotated[Path | None, _default_hint("")]
+Count = Annotated[int | None, _default_hint("")]
+File = Annotated[Path | None, _default_hint("")]
 
 
 @dataclasses.dataclass(frozen=True)
-class _Command:
-  json: _Flag = False
+class Command:
+  """Options of every command."""
+
+  uses_jax: ClassVar[bool] = True
+  """Whether the command needs the settings of ``runtime.configure``."""
+
+  json: Flag = False
   """Print only one JSON object on standard output."""
 
 
 @dataclasses.dataclass(frozen=True)
-class _Play(_Command):
+class _Play(Command):
   episodes: int = 200
   """Number of episodes."""
 
   seed: int = 0
   """Random seed of the episodes and of the policy or noise."""
 
-  video: _File = None
+  video: File = None
   """Also write a video of the first four episodes to this .mp4 or .gif file."""
 
-  overwrite: _Flag = False
+  overwrite: Flag = False
   """Replace files that exist."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Train(_Command):
+class Train(Command):
   """Trains an agent: apnpql train PRESET [options].
 
   Every setting of the preset can be overridden, e.g. --agent.epsilon 0.5.
@@ -64,14 +69,14 @@ class Train(_Command):
   ] = None
   """Run folder to create."""
 
-  resume: _File = None
+  resume: File = None
   """Run folder to resume from its latest checkpoint."""
 
   init_from: Annotated[str | None, _default_hint("")] = None
   """Run with whose weights the new one starts: RUN (its newest checkpoint), RUN:STEP or
   RUN:best."""
 
-  overwrite: _Flag = False
+  overwrite: Flag = False
   """Replace the existing run in --run."""
 
   backend: _OfPreset = None
@@ -91,10 +96,10 @@ class Train(_Command):
   """Address and port of the first of several processes, or auto to take it and the next
   two options from the batch system; see docs/scaling.md."""
 
-  processes: _Count = None
+  processes: Count = None
   """Number of processes that share the run."""
 
-  process: _Count = None
+  process: Count = None
   """Index of this process, from 0."""
 
   config: Annotated[TrainConfig, tyro.conf.arg(name="")] = dataclasses.field(
@@ -121,7 +126,7 @@ class Evaluate(_Play):
 
 
 @dataclasses.dataclass(frozen=True)
-class Diagnose(_Command):
+class Diagnose(Command):
   """Reports where and why an agent fails: apnpql diagnose RUN [options]."""
 
   run: tyro.conf.Positional[str] = ""
@@ -153,19 +158,19 @@ class Collect(_Play):
   noise: float = 0.0
   """Standard deviation of the noise on the expert's joint velocities (rad/s)."""
 
-  save: _File = None
+  save: File = None
   """Also record as many episodes, started from training resets, to this demonstrations
   file."""
 
-  append: _Flag = False
+  append: Flag = False
   """Add the episodes to --save if it exists."""
 
-  solved_only: _Flag = False
+  solved_only: Flag = False
   """Save only solved episodes."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Convert(_Command):
+class Convert(Command):
   """Converts a recording to demonstrations: apnpql convert REC.npz TASK OUT.npz."""
 
   recording: tyro.conf.Positional[str] = ""
@@ -178,21 +183,21 @@ class Convert(_Command):
   out: tyro.conf.Positional[str] = ""
   """File to write, for --replay.demonstrations."""
 
-  append: _Flag = False
+  append: Flag = False
   """Add the episodes to the file if it exists."""
 
-  solved_only: _Flag = False
+  solved_only: Flag = False
   """Keep only solved episodes."""
 
-  allow_unsolved: _Flag = False
+  allow_unsolved: Flag = False
   """Write a file of which no episode is solved."""
 
-  overwrite: _Flag = False
+  overwrite: Flag = False
   """Replace the file if it exists."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Repeat(_Command):
+class Repeat(Command):
   """Repeats an update with NaN or infinity: apnpql repeat RUN/faults/step_<n>.npz."""
 
   file: tyro.conf.Positional[str] = ""
@@ -200,10 +205,10 @@ class Repeat(_Command):
 
 
 @dataclasses.dataclass(frozen=True)
-class List(_Command):
+class List(Command):
   """Lists the tasks, presets, algorithms and backends."""
 
-  contacts: _Flag = False
+  contacts: Flag = False
   """Report contacts and physics speed of every scene instead; compiles for minutes."""
 
 

@@ -5,45 +5,41 @@
   python experiments/results/state_comparison.py --tasks push_plate --seeds 0 \
       --rows npql_without_ap sac_without_ap
 
-Trains the runs whose JSON files are missing in state_comparison/ next to this file.
-The rows of the paper have equal budgets of environment steps, updates and candidates.
-Then plots curves.png and writes table.md from all files there. A run that is
-interrupted starts over.
+Trains the runs whose JSON files are missing in state_comparison/ next to this file, as
+a sweep in runs/state_comparison: the same command again continues it. The rows of the
+paper have equal budgets of environment steps, updates and candidates. Then plots
+curves.png and writes table.md from all files there.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 import itertools
 import json
 import os
 from pathlib import Path
 import subprocess
 import sys
-import tempfile
 from typing import Any, NamedTuple
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
-from summarize import GOAL
 
-from apnpql_jax.cli.options import Train, parse
-from apnpql_jax.config.files import (
-  config_diff,
-  config_from_json,
-  format_diff,
-  load_preset,
-)
+from apnpql_jax.cli.sweep import config_of as config_of_options
+from apnpql_jax.config.files import config_diff, config_from_json, format_diff
 from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.errors import FAILED, RunStopped
+from apnpql_jax.reports import figure, tables
+from apnpql_jax.reports.groups import IGNORED, Group
+from apnpql_jax.reports.reading import Run
 from apnpql_jax.runs.metrics import read_rows
-from apnpql_jax.runs.run_folder import RunFolder, open_run
+from apnpql_jax.sweeps import manifest, training
+from apnpql_jax.sweeps.local import LocalLauncher
+from apnpql_jax.sweeps.plan import Planned
 
 OUT = Path(__file__).resolve().with_suffix("")
+
+SWEEP = Path("runs/state_comparison")
+"""Folder of the runs."""
 
 
 class Row(NamedTuple):
@@ -118,6 +114,7 @@ def options_of(task: str, row: str, seed: int) -> list[str]:
     f"--env.obs state --agent.algorithm {algorithm} --seed {seed} --no-video "
     "--env.worlds 32 --env.bank-rows 2048 "
     "--eval-acting policy --agent.candidate-precision float32 "
+    "--replay.allow-unsolved "  # As when the stored results were made; no effect here.
     f"--replay.expert-steps {EXPERT_STEPS.get(task, 25_600)} "
     f"--total-steps {budget * STEPS} --eval-every {budget * STEPS // EVALUATIONS} "
     f"--agent.target-samples {CANDIDATES} --agent.policy-samples {CANDIDATES} {flags}"
@@ -127,46 +124,61 @@ def options_of(task: str, row: str, seed: int) -> list[str]:
 
 def config_of(task: str, row: str, seed: int) -> TrainConfig:
   """Returns the settings of a run."""
-  base = Train(config=load_preset(task))
-  return parse(Train, "train", options_of(task, row, seed), default=base).config
+  return config_of_options([task, *options_of(task, row, seed)])
 
 
-def train(task: str, row: str, seed: int) -> None:
-  """Trains and evaluates a run, and writes its result when all is complete."""
-  command, path = (
-    ["train", task, *options_of(task, row, seed)],
-    path_of(task, row, seed),
+def train(runs: list[tuple[str, str, int]], jobs: int) -> str:
+  """Trains and evaluates runs (task, row, seed), and writes the result of each.
+
+  Returns:
+    What went wrong with some of them, or an empty text.
+  """
+  plan = [Planned(path_of(*run).stem, [run[0], *options_of(*run)]) for run in runs]
+  sweep = manifest.open_folder(SWEEP, plan)
+  failure = ""
+  try:
+    training.train(sweep, LocalLauncher(jobs))
+  except RunStopped as stop:
+    failure = str(stop)
+    if stop.code != FAILED:
+      sys.exit(failure)
+  done = {entry.name for entry in sweep.runs if entry.state == manifest.DONE}
+  for run in runs:
+    if path_of(*run).stem in done:
+      write_result(*run)
+  return failure
+
+
+def write_result(task: str, row: str, seed: int) -> None:
+  """Evaluates a trained run and writes its result."""
+  path = path_of(task, row, seed)
+  run = SWEEP / path.stem
+  play = f"--episodes {EPISODES} --seed {EPISODES_SEED} --json".split()
+  play = [sys.executable, "-m", "apnpql_jax", "evaluate", str(run), *play]
+  # "greedy" of the stored results: the highest Q of q, or the mean of a Gaussian.
+  non_parametric = ROWS[row].algorithm == "ap_npql"
+  final, greedy = (
+    json.loads(subprocess.check_output([*play, "--acting", acting]))
+    for acting in ("policy", "greedy" if non_parametric else "mean")
   )
-  with tempfile.TemporaryDirectory() as folder:
-    run = Path(folder) / "run"
-    apnpql = [sys.executable, "-m", "apnpql_jax"]
-    subprocess.run([*apnpql, *command, "--run", str(run)], check=True)
-    play = f"--episodes {EPISODES} --seed {EPISODES_SEED} --json".split()
-    play = [*apnpql, "evaluate", str(run), *play]
-    # "greedy" of the stored results: the highest Q of q, or the mean of a Gaussian.
-    non_parametric = ROWS[row].algorithm == "ap_npql"
-    final, greedy = (
-      json.loads(subprocess.check_output([*play, "--acting", acting]))
-      for acting in ("policy", "greedy" if non_parametric else "mean")
-    )
-    result = {
-      "command": command,
-      "versions": json.loads((run / "versions.json").read_text()),
-      "config": json.loads((run / "config.json").read_text()),
-      "final": final,
-      "greedy": greedy,
-      "evaluations": evaluations(open_run(run)),
-    }
+  result = {
+    "command": ["train", task, *options_of(task, row, seed)],
+    "versions": json.loads((run / "versions.json").read_text()),
+    "config": json.loads((run / "config.json").read_text()),
+    "final": final,
+    "greedy": greedy,
+    "evaluations": evaluations(run),
+  }
   part = path.with_suffix(".part")
   part.write_text(json.dumps(result, indent=1) + "\n")
   os.replace(part, path)
   print(f"{path.stem}: {final['successes']} of {EPISODES}", flush=True)
 
 
-def evaluations(folder: RunFolder) -> list[dict[str, Any]]:
+def evaluations(run: Path) -> list[dict[str, Any]]:
   """Returns the held-out evaluations, each with the training metrics before it."""
   found, last = [], {}
-  for row in read_rows(folder.path / "metrics.jsonl"):
+  for row in read_rows(run / "metrics.jsonl"):
     last |= {name: x for name, x in row.items() if name.startswith(KEPT)}
     if "eval/success_rate" in row:
       names = ("step", "time/wall_s", "eval/success_rate", "eval/episodes")
@@ -185,7 +197,9 @@ def results() -> dict[tuple[str, str], list[Result]]:
     for path in sorted(OUT.glob(f"{task}-{row}-*.json")):
       result = json.loads(path.read_text())
       was = config_from_json(json.dumps(result["config"]))
-      if changed := config_diff(was, config_of(task, row, was.seed)):
+      diff = config_diff(was, config_of(task, row, was.seed))
+      # Presets may save at other times, for instance.
+      if changed := {name: x for name, x in diff.items() if name not in IGNORED}:
         sys.exit(f"{path.name}: {format_diff(changed)}; remove it to train it again")
       found.setdefault((task, row), []).append(result)
   return found
@@ -193,65 +207,40 @@ def results() -> dict[tuple[str, str], list[Result]]:
 
 def plot(found: dict[tuple[str, str], list[Result]]) -> None:
   """Plots a panel per task: the mean over seeds, and the range between them."""
-  figure, panels = plt.subplots(
-    1, len(TASKS), figsize=(3.4 * len(TASKS), 3.2), sharey=True, layout="constrained"
-  )
-  for panel, task in zip(panels, TASKS, strict=True):
-    for color, row in enumerate(PAPER):
-      if runs := found.get((task, row)):
-        curves = [run["evaluations"] for run in runs]
-        rates = 100 * np.array([[x["eval/success_rate"] for x in c] for c in curves])
-        steps = [x["step"] / 1000 for x in curves[0]]
-        panel.plot(steps, rates.mean(0), ".-", color=f"C{color}", label=row)
-        panel.fill_between(
-          steps, rates.min(0), rates.max(0), color=f"C{color}", alpha=0.2, linewidth=0
-        )
-    panel.set(title=task, xlabel="1,000 environment steps")
-    panel.set(xlim=(0, STEPS / 1000), ylim=(-2, 102))
-  panels[0].set_ylabel("held-out success (%)")
-  panels[0].legend()
-  figure.savefig(OUT / "curves.png", dpi=120)
+  groups = [
+    Group(task, row, [as_run(result) for result in found[task, row]])
+    for task, row in itertools.product(TASKS, PAPER)
+    if (task, row) in found
+  ]
+  figure.save(groups, OUT / "curves.png", axes=["steps"], band="range")
 
 
 def table(found: dict[tuple[str, str], list[Result]]) -> str:
   """Returns a table of the success per seed and the steps to reach the goal."""
-  lines = [
-    f"| task | row | steps | solved of {EPISODES}, by seed | mean | greedy, by seed "
-    f"| first at {100 * GOAL:.0f} % after steps |",
-    "|---|---|---|---|---|---|---|",
-  ]
-  for (task, row), runs in found.items():
-    solved, greedy = (
-      [run[kind]["successes"] for run in runs] for kind in ("final", "greedy")
+  goal = f"first at {100 * tables.GOAL:.0f} % after steps"
+  solved = f"solved of {EPISODES}, by seed"
+  rows = [["task", "row", "steps", solved, "mean", "greedy, by seed", goal]]
+  for (task, row), results in found.items():
+    runs = [as_run(result) for result in results]
+    counts, greedy = (
+      [result[kind]["successes"] for result in results] for kind in ("final", "greedy")
     )
-    lines.append(
-      f"| {task} | {row} | {ROWS[row].budget * STEPS:,} | {_listed(solved)} "
-      f"| {100 * np.mean(solved) / EPISODES:.0f} % | {_listed(greedy)} "
-      f"| {_listed(map(_steps_to_goal, runs))} |"
-    )
-  commits = {
-    r["versions"]["git"]["commit"][:7] for runs in found.values() for r in runs
-  }
-  return "\n".join(lines) + f"\n\nMade at commit {_listed(sorted(commits))}.\n"
+    mean = f"{100 * np.mean(counts) / EPISODES:.0f} %"
+    reached = tables.listed(tables.to_goal(run, "steps") for run in runs)
+    budget = f"{ROWS[row].budget * STEPS:,}"
+    listed = tables.listed(counts), mean, tables.listed(greedy)
+    rows.append([task, row, budget, *listed, reached])
+  runs = [as_run(result) for results in found.values() for result in results]
+  made = f"Made at commit {tables.listed(tables.commits(runs))}."
+  return f"{tables.markdown(rows)}\n\n{made}\n"
 
 
-def _listed(values: Iterable[object]) -> str:
-  return ", ".join(map(str, values))
-
-
-def _steps_to_goal(run: Result) -> str:
-  rows = run["evaluations"]
-  hits = [row["step"] for row in rows if row["eval/success_rate"] >= GOAL]
-  return f"{hits[0]:,.0f}" if hits else f"> {rows[-1]['step']:,.0f}"
-
-
-def _pool(jobs: int) -> ThreadPoolExecutor:
-  """Returns threads that pin their runs to separate cores."""
-  cores = sorted(os.sched_getaffinity(0))
-  shares = iter([cores[i::jobs] or cores for i in range(jobs)])
-  return ThreadPoolExecutor(
-    jobs, initializer=lambda: os.sched_setaffinity(0, next(shares))
-  )
+def as_run(result: Result) -> Run:
+  """Returns a stored result as the reports of the package take it."""
+  config = config_from_json(json.dumps(result["config"]))
+  name = f"{config.env.task}-{config.agent.algorithm}-{config.seed}"
+  kept = result["evaluations"], result["final"], result["versions"]
+  return Run(name, config, *kept)
 
 
 def main() -> None:
@@ -264,17 +253,15 @@ def main() -> None:
   args = parser.parse_args()
   OUT.mkdir(exist_ok=True)
   results()  # Fails before hours of training.
-  with _pool(args.jobs) as pool:
-    runs = [
-      pool.submit(train, task, row, seed)
-      for seed, task, row in itertools.product(args.seeds, args.tasks, args.rows)
-      if not path_of(task, row, seed).exists()
-    ]
+  wanted = itertools.product(args.seeds, args.tasks, args.rows)
+  runs = [(task, row, seed) for seed, task, row in wanted]
+  missing = [run for run in runs if not path_of(*run).exists()]
+  failure = train(missing, args.jobs) if missing else ""
   found = results()
   plot(found)
   (OUT / "table.md").write_text(table(found))
-  for run in runs:
-    run.result()  # Raises the error of a failed run; the others are stored.
+  if failure:
+    sys.exit(failure)
 
 
 if __name__ == "__main__":

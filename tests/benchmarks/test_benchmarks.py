@@ -84,6 +84,7 @@ def dicts(tree: Any) -> Iterator[dict[str, Any]]:
     ("learner", []),
     ("learner", ["--lstm-instants", "2", "--phi", "once"]),
     ("timeline", []),
+    ("seeds", ["--obs", "state"]),
     ("encoder_layouts", []),
     ("env_steps", []),
     ("env_steps", ["--obs", "state"]),

@@ -28,3 +28,16 @@ def test_rows_of_the_paper_differ_in_the_algorithm_and_its_own_settings(task: st
   own = {"algorithm", "epsilon", "policy_initial_std", "min_alpha"}
   for other in others:
     assert config_diff(first, other).keys() <= {f"agent.{name}" for name in own}
+
+
+def test_the_stored_results_are_read_and_give_the_stored_table():
+  found = comparison.results()
+  assert len(found) == len(comparison.TASKS) * len(comparison.PAPER) + 2
+  assert comparison.table(found) == (comparison.OUT / "table.md").read_text()
+
+
+def test_the_curves_are_drawn_from_the_stored_results(tmp_path, monkeypatch):
+  found = comparison.results()
+  monkeypatch.setattr(comparison, "OUT", tmp_path)
+  comparison.plot(found)
+  assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")

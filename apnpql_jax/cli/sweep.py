@@ -1,0 +1,158 @@
+"""The command ``apnpql sweep``: many runs with one line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import contextlib
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+import tyro
+
+from apnpql_jax.cli import commands
+from apnpql_jax.cli.options import Command, Count, File, Train, parse
+from apnpql_jax.config import files
+from apnpql_jax.config.checks import validate
+from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.errors import ConfigError, UserError
+from apnpql_jax.runs import run_folder
+from apnpql_jax.sweeps import manifest as states
+from apnpql_jax.sweeps.manifest import Manifest
+from apnpql_jax.sweeps.plan import Planned, make_plan
+
+_ROOT = Path("runs")
+
+
+@dataclasses.dataclass(frozen=True)
+class Sweep(Command):
+  """Trains many runs: apnpql sweep PRESET... [--grid OPTION=A,B]... [train options].
+
+  Options other than those below are those of apnpql train, for all runs. The same
+  command again continues where it stopped.
+
+  apnpql sweep push_plate --grid agent.epsilon=0.5,1,2 --seeds 3 --jobs 2
+
+  apnpql sweep push_plate stack_box --grid algorithm=ap_npql,sac --obs state
+  """
+
+  uses_jax: ClassVar[bool] = False
+
+  presets: tyro.conf.Positional[tuple[str, ...]] = ()
+  """Presets to start from; `apnpql list` shows all."""
+
+  grid: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+  """Values of an option, such as agent.epsilon=0.5,1,2; several make a product."""
+
+  seeds: int = 1
+  """Number of seeds, from 0. To choose them: --grid seed=3,7."""
+
+  jobs: Count = None
+  """Runs at the same time: 1 on this machine, all on a cluster unless given. They
+  share the cores and GPUs evenly."""
+
+  out: Annotated[
+    Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/PRESET-sweep-<n>)")
+  ] = None
+  """Folder of the sweep; runs are added to a sweep that it holds."""
+
+  resume: File = None
+  """Folder of a sweep to continue."""
+
+  launcher: Literal["local", "slurm", "slurm-local"] = "local"
+  """Where runs are started: on this machine, on a Slurm cluster, or on this machine as
+  if it were a cluster. The latter two need the extra `sweep`."""
+
+  slurm: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+  """Settings of the jobs as submitit names them, such as timeout_min=240,
+  cpus_per_task=8, gpus_per_node=1 or slurm_partition=gpu."""
+
+  train: tyro.conf.Suppress[tuple[str, ...]] = ()
+
+
+def parse_sweep(argv: Sequence[str]) -> Sweep:
+  """Returns the options of a sweep; those it does not have itself are in ``train``."""
+  names = [x.name for x in dataclasses.fields(Sweep) if x.name != "train"]
+  own = {*(f"--{name}" for name in names), "-h", "--help"}
+  mine: list[str] = []
+  others: list[str] = []
+  chosen = mine
+  for word in argv:
+    if word.startswith("--") or word == "-h":
+      chosen = mine if word.partition("=")[0] in own else others
+    chosen.append(word)
+  args = parse(Sweep, "sweep", mine)
+  return dataclasses.replace(args, train=tuple(others))
+
+
+def sweep(args: Sweep) -> dict[str, Any]:
+  """Trains the runs that are not done; returns the states of all."""
+  from apnpql_jax.sweeps import training
+
+  if args.jobs is not None and args.jobs < 1:
+    raise ConfigError(f"--jobs {args.jobs} must be at least 1")
+  with contextlib.ExitStack() as stack:
+    manifest = _open(args, stack)
+    training.train(manifest, _launcher(args, manifest))
+  folder = str(training.shown(manifest.folder))
+  runs = {entry.name: entry.state for entry in manifest.runs}
+  return {"sweep": folder, "runs": runs if args.json else len(runs)}
+
+
+def config_of(argv: Sequence[str]) -> TrainConfig:
+  """Returns the checked settings of ``apnpql train`` with a preset and options.
+
+  Raises:
+    ConfigError: A setting is unknown or invalid.
+  """
+  base = Train(config=files.load_preset(argv[0]))
+  config = commands.with_shortcuts(parse(Train, "train", argv, default=base))
+  validate(config)
+  return config
+
+
+def _open(args: Sweep, stack: contextlib.ExitStack) -> Manifest:
+  """Returns the sweep to continue, or a new one."""
+  if args.resume is not None:
+    if args.presets or args.grid or args.train or args.out:
+      raise ConfigError("--resume names the sweep itself; give only --jobs, --launcher")
+    return states.load(args.resume)
+  if not args.presets:
+    names = ", ".join(files.preset_names())
+    raise ConfigError(f"sweep needs a preset; choose from {names}")
+  plan = make_plan(args.presets, args.grid, seeds=args.seeds, options=args.train)
+  for run in plan:
+    _check(run)
+  folder = args.out or states.find_equal(_ROOT, plan)
+  if folder is None:
+    name = f"{'-'.join(args.presets)}-sweep"
+    folder = stack.enter_context(run_folder.new_run_dir(name, _ROOT))
+  return states.open_folder(folder, plan)
+
+
+def _check(run: Planned) -> None:
+  """Raises ``ConfigError`` that names a run whose options cannot be meant."""
+  fixed = {"--run", "--resume", "--overwrite", "--json", "--coordinator"}
+  if found := fixed & {word.partition("=")[0] for word in run.argv}:
+    raise ConfigError(f"leave out {', '.join(sorted(found))}; the sweep sets it itself")
+  try:
+    config_of(run.argv)
+  except UserError as error:
+    raise ConfigError(f"{run.name}: {error}") from None
+
+
+def _launcher(args: Sweep, manifest: Manifest) -> Any:
+  """Returns the launcher that was asked for."""
+  from apnpql_jax.sweeps.local import LocalLauncher
+  from apnpql_jax.sweeps.slurm import ALL_AT_ONCE, SlurmLauncher, parse_settings
+
+  if args.launcher == "local":
+    if args.slurm:
+      raise ConfigError("--slurm needs --launcher slurm")
+    return LocalLauncher(args.jobs or 1)
+  return SlurmLauncher(
+    manifest.folder / "submitit",
+    jobs=args.jobs or ALL_AT_ONCE,
+    settings=parse_settings(args.slurm),
+    cluster="slurm" if args.launcher == "slurm" else "local",
+  )

@@ -1,0 +1,1 @@
+"""Reports of finished and unfinished runs; none of this imports JAX."""

@@ -1,0 +1,1 @@
+"""Sweeps: many runs of one plan, on one machine or a cluster; nothing imports JAX."""

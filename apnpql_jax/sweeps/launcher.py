@@ -1,0 +1,58 @@
+"""What a launcher does: it starts runs somewhere and finds out when they have ended."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import sys
+from typing import NamedTuple, Protocol
+
+from apnpql_jax.runs.run_folder import CONFIG_FILE
+
+
+class Work(NamedTuple):
+  """A run to start or to resume."""
+
+  name: str
+  argv: list[str]  # preset and options of ``apnpql train``
+  run_dir: Path
+  log: Path  # to which the output is added
+
+  def command(self) -> list[str]:
+    """Returns the command that starts the run, or resumes it if it has begun."""
+    run_dir = str(self.run_dir)
+    begun = (self.run_dir / CONFIG_FILE).is_file()
+    rest = ["--resume", run_dir] if begun else [*self.argv, "--run", run_dir]
+    return [sys.executable, "-m", "apnpql_jax", "train", *rest]
+
+
+class Job(Protocol):
+  """A run in progress."""
+
+  name: str
+  """Name of the job in a cluster, to find it again; empty if that is impossible."""
+
+  error: str
+  """Why a job has no exit code of its own; else empty."""
+
+  def poll(self) -> int | None:
+    """Returns the exit code of ``apnpql train``, or None while it runs."""
+
+  def stop(self) -> None:
+    """Sends SIGTERM, at which the run saves and ends."""
+
+
+class Launcher(Protocol):
+  """Where runs are started."""
+
+  jobs: int
+  """Runs at the same time."""
+
+  def start(self, work: Work) -> Job:
+    """Starts a run; fewer than ``jobs`` are in progress.
+
+    Raises:
+      OSError, UserError: It cannot be started.
+    """
+
+  def find(self, name: str) -> Job | None:
+    """Returns a job of an earlier process that is still in progress, if any."""

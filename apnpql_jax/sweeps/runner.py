@@ -1,0 +1,97 @@
+"""Runner of a sweep: starts what waits, records what ends, and stops on a signal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import time
+
+from apnpql_jax.errors import INTERRUPTED, UserError, one_line
+from apnpql_jax.runs import run_folder
+from apnpql_jax.sweeps import manifest as states
+from apnpql_jax.sweeps.following import last_line
+from apnpql_jax.sweeps.launcher import Job, Launcher
+from apnpql_jax.sweeps.manifest import Entry, Manifest
+
+_POLL_S = 0.5
+
+
+class Runner:
+  """Loop over the runs of a sweep, of which one must not cost the others anything."""
+
+  def __init__(
+    self, manifest: Manifest, launcher: Launcher, report: Callable[[Entry], None]
+  ):
+    """Starts nothing yet; ``report`` is called with each run whose state changes."""
+    self._manifest, self._launcher, self._report = manifest, launcher, report
+    self._active: dict[str, tuple[Entry, Job]] = {}
+
+  def run(self, caught: Sequence[int], show: Callable[[], None]) -> None:
+    """Trains all runs that are not done.
+
+    Args:
+      caught: Signals so far; after the first, the runs save and no other starts.
+      show: Called in every turn, to show the progress.
+    """
+    self._manifest.folder.mkdir(parents=True, exist_ok=True)
+    with run_folder.lock(self._manifest.folder):
+      self._manifest.refresh()
+      self._manifest.save()
+      self._find_again()
+      stopping = False
+      while self._active or (not caught and self._waiting()):
+        if caught and not stopping:
+          stopping = True
+          for _, job in self._active.values():
+            job.stop()
+        if not caught:
+          self._start()
+        self._collect()
+        show()
+        time.sleep(_POLL_S)
+      self._manifest.save()
+
+  def _waiting(self) -> list[Entry]:
+    return [entry for entry in self._manifest.runs if entry.state == states.WAITING]
+
+  def _find_again(self) -> None:
+    """Takes over the jobs that an earlier process has left running on a cluster."""
+    for entry in self._waiting():
+      if job := self._launcher.find(entry.job):
+        self._active[entry.name] = entry, job
+        self._change(entry, states.RUNNING)
+
+  def _start(self) -> None:
+    """Starts waiting runs while there is room."""
+    for entry in self._waiting()[: self._launcher.jobs - len(self._active)]:
+      entry.attempts += 1
+      entry.code, entry.line = None, ""
+      try:
+        job = self._launcher.start(self._manifest.work(entry))
+      except (OSError, UserError) as error:
+        entry.line = one_line(error)
+        self._change(entry, states.FAILED)
+        continue
+      entry.job = job.name
+      self._active[entry.name] = entry, job
+      self._change(entry, states.RUNNING)
+
+  def _collect(self) -> None:
+    """Records the runs that have ended."""
+    for entry, job in list(self._active.values()):
+      if (code := job.poll()) is None:
+        continue
+      del self._active[entry.name]
+      entry.code, entry.job = code, ""
+      if code == 0:
+        self._change(entry, states.DONE)
+        continue
+      entry.line = job.error or last_line(self._manifest.work(entry).log)
+      if code < 0:
+        entry.line = f"killed by signal {-code}; {entry.line}"
+      stopped = code > INTERRUPTED
+      self._change(entry, states.STOPPED if stopped else states.FAILED)
+
+  def _change(self, entry: Entry, state: str) -> None:
+    entry.state = state
+    self._manifest.save()
+    self._report(entry)

@@ -1,0 +1,150 @@
+"""Plans of sweeps, and their manifests."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from run_files import make_run
+
+from apnpql_jax.cli.sweep import config_of, parse_sweep
+from apnpql_jax.errors import ConfigError, FileError
+from apnpql_jax.sweeps import manifest as states
+from apnpql_jax.sweeps.manifest import Manifest, find_equal, load, open_folder
+from apnpql_jax.sweeps.plan import make_plan
+
+
+def test_a_plan_has_every_combination_and_its_settings():
+  grid = ["agent.epsilon=0.5,1", "agent.hidden=16 16,32", "env.randomize=true,false"]
+  plan = make_plan(["push_plate"], grid, seeds=2, options=["--obs", "state"])
+  assert len(plan) == len({run.name for run in plan}) == 16
+  assert plan[0].name == "push_plate-epsilon_0.5-hidden_16_16-randomize_true-seed_0"
+  found = {
+    (x.agent.epsilon, x.agent.hidden, x.env.randomize, x.seed, x.env.obs)
+    for x in (config_of(run.argv) for run in plan)
+  }
+  assert found == {
+    (epsilon, hidden, randomize, seed, "state")
+    for epsilon in (0.5, 1.0)
+    for hidden in ((16, 16), (32,))
+    for randomize in (True, False)
+    for seed in (0, 1)
+  }
+
+
+def test_seeds_can_be_chosen_and_presets_are_an_axis():
+  plan = make_plan(["push_plate", "stack_box"], ["seed=3,7", "video=false"])
+  found = [(x.env.task, x.seed, x.video) for x in (config_of(r.argv) for r in plan)]
+  tasks = ("push_plate", "stack_box")
+  assert found == [(task, seed, False) for seed in (3, 7) for task in tasks]
+
+
+@pytest.mark.parametrize(
+  ("grid", "seeds", "words"),
+  [
+    (["agent.epsilon"], 1, "not like agent.epsilon=0.5,1,2"),
+    (["agent.epsilon="], 1, "not like"),
+    (["=1"], 1, "not like"),
+    (["agent.epsilon=1,,2"], 1, "not like"),
+    (["agent.epsilon=1", "agent.epsilon=2"], 1, "agent.epsilon twice"),
+    (["agent.epsilon=1,1"], 1, "epsilon_1-seed_0 twice"),
+    (["video=perhaps"], 1, "neither true nor false"),
+    (["seed=1"], 2, "either --seeds or --grid seed"),
+    ([], 0, "--seeds 0 must be at least 1"),
+  ],
+)
+def test_a_plan_that_cannot_be_meant_is_refused(grid, seeds, words):
+  with pytest.raises(ConfigError, match=words):
+    make_plan(["push_plate"], grid, seeds=seeds)
+
+
+def test_options_that_the_sweep_does_not_have_are_those_of_train():
+  line = (
+    "push_plate --obs state --grid agent.n-step=2,3 --agent.hidden 16 16 --seeds 2 "
+    "--jobs 4 --agent.epsilon-nu -14 --no-video --grid agent.gamma=0.9 --json"
+  )
+  args = parse_sweep(line.split())
+  assert args.presets == ("push_plate",) and args.json
+  assert (args.seeds, args.jobs) == (2, 4)
+  assert args.grid == ("agent.n-step=2,3", "agent.gamma=0.9")
+  train = "--obs state --agent.hidden 16 16 --agent.epsilon-nu -14 --no-video"
+  assert args.train == tuple(train.split())
+
+
+PLAN = make_plan(["push_plate"], ["agent.epsilon=0.5,1"])
+
+
+def stored(folder: Path) -> Manifest:
+  """Writes the manifest of ``PLAN`` to a new folder."""
+  made = open_folder(folder, PLAN)
+  folder.mkdir(exist_ok=True)
+  made.save()
+  return made
+
+
+def test_a_manifest_is_read_as_it_was_written(tmp_path):
+  made = stored(tmp_path / "sweep")
+  made.runs[1].state, made.runs[1].line = states.FAILED, "apnpql: no"
+  made.save()
+  assert load(tmp_path / "sweep") == made
+  assert [(x.name, x.argv) for x in made.runs] == PLAN
+
+
+def test_what_is_done_is_read_from_the_run_folders(tmp_path):
+  sweep = Manifest(tmp_path, [states.Entry(f"run-{i}", []) for i in range(3)])
+  make_run(tmp_path / "run-0", [0.5])
+  make_run(tmp_path / "run-1", [0.5], finished=False)
+  sweep.runs[1].state = states.DONE  # Its folder was replaced.
+  sweep.runs[2].state = states.FAILED
+  sweep.refresh()
+  assert [entry.state for entry in sweep.runs] == ["done", "waiting", "waiting"]
+  begun, new = (sweep.work(entry).command() for entry in sweep.runs[1:])
+  assert begun[-2:] == ["--resume", str(tmp_path / "run-1")]
+  assert new[-2:] == ["--run", str(tmp_path / "run-2")]
+
+
+def test_the_same_plan_finds_its_sweep_and_a_larger_one_can_be_added(tmp_path):
+  stored(tmp_path / "sweep")
+  (tmp_path / "other").mkdir()
+  (tmp_path / "other" / states.MANIFEST_FILE).write_text("{")
+  assert find_equal(tmp_path, PLAN) == tmp_path / "sweep"
+  more = make_plan(["push_plate"], ["agent.epsilon=0.5,1"], seeds=2)
+  assert find_equal(tmp_path, more) is None
+  grown = open_folder(tmp_path / "sweep", more)
+  assert {entry.name for entry in grown.runs} == {run.name for run in more}
+
+
+def test_a_run_with_other_options_is_not_taken_for_the_same(tmp_path):
+  stored(tmp_path / "sweep")
+  other = make_plan(["push_plate"], ["agent.epsilon=0.5,1"], options=["--obs", "state"])
+  with pytest.raises(ConfigError, match="with other options: apnpql train push_plate"):
+    open_folder(tmp_path / "sweep", other)
+
+
+def test_a_folder_with_other_files_is_refused(tmp_path):
+  (tmp_path / "notes.txt").write_text("mine")
+  with pytest.raises(ConfigError, match="holds something else"):
+    open_folder(tmp_path, PLAN)
+
+
+@pytest.mark.parametrize(
+  "change",
+  [
+    lambda data: data.update(format=2),
+    lambda data: data.pop("runs"),
+    lambda data: data["runs"][0].update(name="../../elsewhere"),
+    lambda data: data["runs"][0].update(name=".."),
+    lambda data: data["runs"][0].update(argv=[1]),
+    lambda data: data["runs"][0].update(unknown=1),
+    lambda data: data.update(runs=[3]),
+  ],
+)
+def test_a_foreign_manifest_is_refused_in_one_line(change, tmp_path: Path):
+  stored(tmp_path)
+  path = tmp_path / states.MANIFEST_FILE
+  data = json.loads(path.read_text())
+  change(data)
+  path.write_text(json.dumps(data))
+  with pytest.raises(FileError, match="sweep.json cannot be read"):
+    load(tmp_path)

@@ -1,0 +1,269 @@
+"""Sweeps of real processes that stand for trainings: pinning, failures, signals."""
+
+from __future__ import annotations
+
+import io
+import os
+from pathlib import Path
+import signal
+import sys
+import textwrap
+import threading
+import time
+
+import pytest
+from rich.console import Console
+from run_files import make_run
+
+from apnpql_jax.errors import FileError
+from apnpql_jax.runs import run_folder
+from apnpql_jax.sweeps import manifest as states
+from apnpql_jax.sweeps.display import SweepDisplay
+from apnpql_jax.sweeps.following import Follower, last_line
+from apnpql_jax.sweeps.launcher import Work
+from apnpql_jax.sweeps.local import LocalLauncher, available_cores, shares
+from apnpql_jax.sweeps.manifest import Entry, Manifest
+from apnpql_jax.sweeps.runner import Runner
+from apnpql_jax.sweeps.slurm import SlurmLauncher
+
+
+class Script(Work):
+  """Work whose options are a Python program."""
+
+  def command(self) -> list[str]:
+    """Returns the command that runs the program in the folder of the sweep."""
+    return [sys.executable, "-c", *self.argv]
+
+
+class Scripts(Manifest):
+  """Manifest of programs."""
+
+  def work(self, entry: Entry) -> Work:
+    """Returns the program of an entry."""
+    return Script(*super().work(entry))
+
+
+def sweep_of(folder: Path, *programs: str) -> Manifest:
+  """Returns a sweep of programs, named a, b and so on."""
+  names = "abcdefgh"
+  argvs = [[textwrap.dedent(program)] for program in programs]
+  return Scripts(
+    folder, [Entry(n, argv) for n, argv in zip(names, argvs, strict=False)]
+  )
+
+
+def run(
+  sweep: Manifest, *, jobs: int = 1, caught: list[int] | None = None
+) -> list[str]:
+  """Runs a sweep and returns the names of runs in the order in which they started."""
+  started = []
+
+  def report(entry: Entry) -> None:
+    if entry.state == states.RUNNING:
+      started.append(entry.name)
+
+  caught = [] if caught is None else caught
+  Runner(sweep, LocalLauncher(jobs), report).run(caught, lambda: None)
+  return started
+
+
+def test_a_failed_run_costs_the_others_nothing_and_is_retried(tmp_path):
+  once = f"""
+    import pathlib, sys
+    path = pathlib.Path({str(tmp_path / "tried")!r})
+    if not path.exists():
+      path.touch()
+      sys.exit("first line\\napnpql: no luck")
+  """
+  sweep = sweep_of(tmp_path, once, "", "import os; os.kill(os.getpid(), 9)")
+  assert run(sweep) == ["a", "b", "c"]
+  assert [entry.state for entry in sweep.runs] == ["failed", "done", "failed"]
+  first, _, third = states.load(tmp_path).runs
+  assert (first.code, first.line) == (1, "apnpql: no luck")
+  assert third.code == -9 and "killed by signal 9" in third.line
+  make_run(tmp_path / "b", [0.5])  # What a training would have left.
+  assert run(sweep) == ["a", "c"]
+  first, second, _ = states.load(tmp_path).runs
+  assert (first.state, first.attempts, first.line) == (states.DONE, 2, "")
+  assert (second.state, second.attempts) == (states.DONE, 1)
+
+
+def test_a_run_that_cannot_be_started_costs_the_others_nothing(tmp_path):
+  sweep = sweep_of(tmp_path, "", "")
+  (tmp_path / "a.log").mkdir()
+  run(sweep)
+  assert [entry.state for entry in sweep.runs] == ["failed", "done"]
+  assert "Is a directory" in sweep.runs[0].line
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="only on Linux")
+def test_runs_at_the_same_time_have_cores_of_their_own(tmp_path, monkeypatch):
+  monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
+  program = """
+    import os, time
+    time.sleep(1)
+    print(*sorted(os.sched_getaffinity(0)), os.environ["CUDA_VISIBLE_DEVICES"], sep=",")
+  """
+  sweep = sweep_of(tmp_path, program, program)
+  run(sweep, jobs=2)
+  found = [last_line(tmp_path / f"{name}.log").split(",") for name in "ab"]
+  expected = [list(map(str, share)) for share in shares(available_cores(), 2)]
+  assert found == [[*expected[0], "0"], [*expected[1], "1"]]
+
+
+@pytest.mark.parametrize(
+  ("count", "expected"),
+  [
+    (1, [[0, 1, 2, 3, 4]]),
+    (2, [[0, 1], [2, 3, 4]]),
+    (5, [[0], [1], [2], [3], [4]]),
+    (7, [[0], [0], [1], [2], [3], [4], [4]]),
+  ],
+)
+def test_shares_are_neighbors_and_none_is_empty(count, expected):
+  found = shares(range(5), count)
+  assert all(found) and len(found) == count
+  if count <= 5:
+    assert found == expected
+
+
+WAITING = """
+    import signal, sys, time
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(print("saved") or 143))
+    print("ready", flush=True)
+    time.sleep(60)
+"""
+"""Program that ends at SIGTERM as a training does."""
+
+
+def test_a_signal_reaches_the_runs_and_starts_no_more(tmp_path):
+  sweep = sweep_of(tmp_path, *3 * [WAITING])
+  caught: list[int] = []
+
+  def interrupt() -> None:
+    logs = [tmp_path / "a.log", tmp_path / "b.log"]
+    while not all(log.exists() and log.read_text() for log in logs):
+      time.sleep(0.05)
+    caught.append(2)
+
+  threading.Thread(target=interrupt).start()
+  assert run(sweep, jobs=2, caught=caught) == ["a", "b"]
+  assert [entry.state for entry in sweep.runs] == ["stopped", "stopped", "waiting"]
+  assert [entry.line for entry in sweep.runs[:2]] == ["saved", "saved"]
+
+
+@pytest.mark.skipif(not Path("/proc").exists(), reason="only on Linux")
+def test_a_job_whose_time_is_over_saves_and_is_queued_again(tmp_path, monkeypatch):
+  pytest.importorskip("submitit")
+  monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+  program = f"""
+    import pathlib, signal, sys, time
+    path = pathlib.Path({str(tmp_path / "saved")!r})
+    if path.exists():
+      sys.exit(print("resumed"))
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(path.touch() or 143))
+    print("ready", flush=True)
+    time.sleep(600)
+  """
+  sweep = sweep_of(tmp_path, program)
+  launcher = SlurmLauncher(tmp_path / "submitit", cluster="local")
+  log = tmp_path / "a.log"
+
+  def over() -> None:
+    while not (log.exists() and log.read_text()):
+      time.sleep(0.05)
+    job = sweep.runs[0].job
+    children = Path(f"/proc/{job}/task/{job}/children").read_text().split()
+    os.kill(int(children[0]), signal.SIGUSR2)  # As submitit does before the end.
+
+  threading.Thread(target=over).start()
+  Runner(sweep, launcher, lambda _: None).run([], lambda: None)
+  assert log.read_text() == "ready\nresumed\n"
+  (entry,) = states.load(tmp_path).runs
+  assert (entry.state, entry.attempts, entry.code) == (states.DONE, 1, 0)
+
+
+def test_a_signal_reaches_jobs_too(tmp_path, monkeypatch):
+  pytest.importorskip("submitit")
+  monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+  sweep = sweep_of(tmp_path, WAITING)
+  launcher = SlurmLauncher(tmp_path / "submitit", cluster="local")
+  caught: list[int] = []
+  log = tmp_path / "a.log"
+
+  def show() -> None:
+    if log.exists() and log.read_text():
+      caught.append(15)
+
+  Runner(sweep, launcher, lambda _: None).run(caught, show)
+  assert [(x.state, x.code, x.line) for x in sweep.runs] == [("stopped", 143, "saved")]
+
+
+def test_two_processes_cannot_run_one_sweep(tmp_path):
+  sweep = sweep_of(tmp_path, "")
+  with run_folder.lock(tmp_path), pytest.raises(FileError, match="another process"):
+    run(sweep)
+  assert not (tmp_path / states.MANIFEST_FILE).exists()
+
+
+def test_progress_is_read_while_it_is_written(tmp_path):
+  folder = make_run(tmp_path / "a", [0.1, 0.4, 0.6], minutes=1.0)
+  path = folder / "metrics.jsonl"
+  text = path.read_text()
+  half = text.index("\n", text.index('"step": 2000')) + 10
+  path.write_text(text[:half])
+  follower = Follower(folder)
+  follower.update()
+  assert (follower.step, follower.success) == (2000, 0.1)
+  assert follower.share == pytest.approx(2 / 3)
+  assert follower.left_s == pytest.approx(60)
+  path.write_text(text)
+  follower.update()
+  assert (follower.step, follower.success, follower.left_s) == (3000, 0.6, 0)
+  path.write_text(text[:half])  # A resume cuts off what came after its checkpoint.
+  follower.update()
+  assert follower.step == 2000
+
+
+def display_of(folder: Path, stream: io.StringIO) -> SweepDisplay:
+  make_run(folder / "b", [0.25, 0.5], finished=False)
+  sweep = sweep_of(folder, "", "", "")
+  sweep.runs[1].state = states.RUNNING
+  sweep.runs[2].state, sweep.runs[2].line = states.FAILED, "apnpql: disk full"
+  ticks = iter(range(0, 10_000, 100))
+  return SweepDisplay(sweep, stream=stream, clock=lambda: next(ticks))
+
+
+def test_without_a_terminal_there_are_plain_lines(tmp_path):
+  stream = io.StringIO()
+  with display_of(tmp_path, stream) as display:
+    display.show()
+    display.report(display._manifest.runs[2])
+  assert stream.getvalue() == (
+    "1 running, 1 failed, 1 waiting; b 100 %\nfailed c: apnpql: disk full\n"
+  )
+
+
+class Terminal(io.StringIO):
+  """A stream that claims to be a terminal."""
+
+  def isatty(self) -> bool:
+    """Returns True."""
+    return True
+
+
+@pytest.mark.parametrize("columns", [40, 100])
+def test_on_a_terminal_there_is_a_table(columns, tmp_path, monkeypatch):
+  monkeypatch.setenv("COLUMNS", str(columns))
+  monkeypatch.setenv("TERM", "xterm")
+  stream = Terminal()
+  with display_of(tmp_path, stream) as display:
+    display.show()
+    table = display._table()
+  assert "\x1b[?25h" in stream.getvalue()  # The cursor is back.
+  text = io.StringIO()
+  Console(file=text, width=columns).print(table)
+  lines = text.getvalue().splitlines()
+  assert max(map(len, lines)) <= columns
+  (row,) = [line for line in lines if "running" in line and line.split()[0] == "b"]
+  assert "50 %" in row and "100 %" in row
