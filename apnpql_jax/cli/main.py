@@ -14,6 +14,7 @@ from typing import Any
 from apnpql_jax import __version__, errors, runtime
 from apnpql_jax.cli import commands, options
 from apnpql_jax.cli.commands import Json
+from apnpql_jax.cli.new_task import NewTask, new_task
 from apnpql_jax.cli.options import Train, parse
 from apnpql_jax.config import files
 from apnpql_jax.console import Unfailing, print_line, reporting
@@ -77,7 +78,7 @@ def _parse(kind: type[Any], args: Sequence[str]) -> Any:
   if kind is not Train:
     return parse(kind, name, rest)
   # Parsing ends here for --help, which shows the settings of a preset named before it.
-  presets = [arg for arg in rest if arg in files.preset_names()]
+  presets = [arg for arg in rest if files.is_preset(arg)]
   default = Train(config=files.load_preset(presets[0])) if presets else None
   base = commands.base_config(parse(Train, name, rest, default=default))
   return parse(Train, name, rest, default=Train(config=base))
@@ -174,5 +175,6 @@ _COMMANDS: dict[str, tuple[type[Any], Callable[[Any], Json]]] = {
   "collect": (options.Collect, commands.collect),
   "convert": (options.Convert, commands.convert),
   "repeat": (options.Repeat, commands.repeat),
+  "new-task": (NewTask, new_task),
   "list": (options.List, commands.list_names),
 }

@@ -34,6 +34,12 @@ class _Command:
 
 
 @dataclasses.dataclass(frozen=True)
+class _OfRun(_Command):
+  task_file: _File = None
+  """Python file of the run's task, if that is not installed."""
+
+
+@dataclasses.dataclass(frozen=True)
 class _Play(_Command):
   episodes: int = 200
   """Number of episodes."""
@@ -49,14 +55,15 @@ class _Play(_Command):
 
 
 @dataclasses.dataclass(frozen=True)
-class Train(_Command):
+class Train(_OfRun):
   """Trains an agent: apnpql train PRESET [options].
 
   Every setting of the preset can be overridden, e.g. --agent.epsilon 0.5.
   """
 
   preset: tyro.conf.Positional[str] = ""
-  """Preset to start from; `apnpql list` shows all."""
+  """Preset to start from; `apnpql list` shows all. Or the path of a file with a preset
+  and its task, such as ./my_task.py."""
 
   run: Annotated[
     Path | None, _default_hint("(default: first free runs/PRESET-<n>)")
@@ -98,7 +105,7 @@ class Train(_Command):
 
 
 @dataclasses.dataclass(frozen=True)
-class Evaluate(_Play):
+class Evaluate(_Play, _OfRun):
   """Plays held-out episodes with a trained agent: apnpql evaluate RUN [options]."""
 
   run: tyro.conf.Positional[str] = ""
@@ -116,7 +123,7 @@ class Evaluate(_Play):
 
 
 @dataclasses.dataclass(frozen=True)
-class Diagnose(_Command):
+class Diagnose(_OfRun):
   """Reports where and why an agent fails: apnpql diagnose RUN [options]."""
 
   run: tyro.conf.Positional[str] = ""
@@ -140,7 +147,7 @@ class Collect(_Play):
   """Plays episodes with the scripted expert: apnpql collect TASK [options]."""
 
   task: tyro.conf.Positional[str] = ""
-  """Task to play; `apnpql list` shows all."""
+  """Task to play, or the path of its file; `apnpql list` shows all."""
 
   backend: str = "auto"
   """Physics engine: auto, mjx or native."""
@@ -168,7 +175,7 @@ class Convert(_Command):
   demonstrations file."""
 
   task: tyro.conf.Positional[str] = ""
-  """Task of the recording; `apnpql list` shows all."""
+  """Task of the recording, or the path of its file; `apnpql list` shows all."""
 
   out: tyro.conf.Positional[str] = ""
   """File to write, for --replay.demonstrations."""
@@ -187,7 +194,7 @@ class Convert(_Command):
 
 
 @dataclasses.dataclass(frozen=True)
-class Repeat(_Command):
+class Repeat(_OfRun):
   """Repeats an update with NaN or infinity: apnpql repeat RUN/faults/step_<n>.npz."""
 
   file: tyro.conf.Positional[str] = ""
@@ -196,7 +203,10 @@ class Repeat(_Command):
 
 @dataclasses.dataclass(frozen=True)
 class List(_Command):
-  """Lists the tasks, presets, algorithms and backends."""
+  """Lists the tasks, presets, algorithms and backends: apnpql list [FILE...]."""
+
+  files: tyro.conf.Positional[tuple[Path, ...]] = ()
+  """Python files whose tasks to list as well."""
 
   contacts: _Flag = False
   """Report contacts and physics speed of every scene instead; compiles for minutes."""

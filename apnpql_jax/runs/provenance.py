@@ -10,10 +10,15 @@ import platform
 import subprocess
 from typing import Any
 
+from apnpql_jax.config import user_files
+
 _PACKAGES = (
   "apnpql-jax jax jaxlib flax optax distrax orbax-checkpoint mujoco mujoco-mjx mink "
   "numpy"
 ).split()
+
+_TASK = "task_file"
+"""Key of the hash of the task's file."""
 
 
 def changed_versions(run_dir: Path, *, devices: int = 1) -> list[str]:
@@ -30,7 +35,7 @@ def changed_versions(run_dir: Path, *, devices: int = 1) -> list[str]:
   except (OSError, ValueError):
     return ["versions.json cannot be read"]
   new = leaves.named(describe_versions(devices))
-  names = sorted((old.keys() | new.keys()) - {"created"})
+  names = sorted((old.keys() | new.keys()) - {"created", _TASK})
   return [
     f"{name.rpartition('/')[2]} {old.get(name)} -> {new.get(name)}"
     for name in names
@@ -38,8 +43,23 @@ def changed_versions(run_dir: Path, *, devices: int = 1) -> list[str]:
   ]
 
 
-def describe_versions(devices: int) -> dict[str, Any]:
-  """Returns versions of Python and packages, git commit of a checkout, devices."""
+def changed_task(run_dir: Path, task_file: Path) -> bool:
+  """Returns whether a task's file or MJCF differs from those that a run began with.
+
+  False if the record cannot be read, which ``changed_versions`` reports.
+  """
+  try:
+    record = json.loads((run_dir / "versions.json").read_text(encoding="utf-8"))
+    return record[_TASK] != user_files.digest(task_file)
+  except (OSError, ValueError, KeyError, TypeError):
+    return False
+
+
+def describe_versions(devices: int, task_file: str = "") -> dict[str, Any]:
+  """Returns versions of Python and packages, git commit of a checkout, devices.
+
+  ``task_file`` is that of ``EnvConfig``; its contents are recorded as a hash.
+  """
   import jax  # Here, so that run folders can be named without JAX.
 
   return {
@@ -48,6 +68,7 @@ def describe_versions(devices: int) -> dict[str, Any]:
     "platform": platform.platform(),
     "packages": {name: _version(name) for name in _PACKAGES},
     "git": _git(Path(__file__).parents[1]),
+    _TASK: user_files.digest(task_file) if task_file else None,
     "device": {
       "backend": jax.default_backend(),
       "kind": jax.devices()[0].device_kind,

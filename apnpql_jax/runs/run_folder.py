@@ -56,12 +56,12 @@ def create(
   """
   _check_characters(run_dir, _PATTERN)
   _check_replaceable(run_dir, overwrite=overwrite)
-  versions = json.dumps(describe_versions(devices), indent=2) + "\n"
+  versions = describe_versions(devices, config.env.task_file)
   run_dir = run_dir.absolute()
   new, old = _free_name(run_dir, "new"), _free_name(run_dir, "replaced")
   try:
     new.mkdir(parents=True)
-    write_text(new / "versions.json", versions)
+    write_text(new / "versions.json", json.dumps(versions, indent=2) + "\n")
     write_text(new / CONFIG_FILE, files.config_to_json(config))
     if run_dir.exists():
       run_dir.rename(old)

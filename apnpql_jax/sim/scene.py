@@ -15,6 +15,7 @@ import mujoco
 from mujoco import mjx
 import numpy as np
 
+from apnpql_jax.config import files
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.sim import scene_checks
 
@@ -119,13 +120,19 @@ def _compile(
   path: pathlib.Path, edit: Callable[[mujoco.MjSpec], None]
 ) -> mujoco.MjModel:
   try:
-    spec = mujoco.MjSpec.from_file(str(path))
+    # A file elsewhere may include the robot and its surroundings by name.
+    shared = {
+      name: text
+      for name, text in files.mjcf_files().items()
+      if not (path.parent / name).exists()
+    }
+    spec = mujoco.MjSpec.from_file(str(path), include=shared)
     edit(spec)
     sizes = {key.name: len(key.qpos) for key in spec.keys}
     model = spec.compile()
   except ValueError as error:
     reason = str(error).splitlines()[0]
-    raise ConfigError(f"{path.name} does not compile: {reason}") from error
+    raise ConfigError(f"{path} does not compile: {reason}") from error
   for name, size in sizes.items():  # MuJoCo would complete it silently.
     if size != model.nq:
       raise ConfigError(
