@@ -1,4 +1,4 @@
-"""docs/add_a_task.md is followed to the letter, in a copy of the project."""
+"""docs/add_a_task.md is followed to the letter, from an empty folder."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import json
 import os
 from pathlib import Path
 import re
-import shutil
 import subprocess
 import sys
 
-ROOT = Path(__file__).resolve().parents[1]
+from apnpql_jax import testing
+
+ROOT = testing.ROOT
 
 
 def blocks() -> dict[str, str]:
@@ -20,41 +21,113 @@ def blocks() -> dict[str, str]:
   return dict(found)
 
 
+def run(
+  folder: Path, *args: str, site: Path = ROOT
+) -> subprocess.CompletedProcess[str]:
+  path = os.pathsep.join({str(site): None, str(ROOT): None})
+  return subprocess.run(
+    [sys.executable, "-m", "apnpql_jax", *args, "--json"],
+    cwd=folder,
+    env=dict(os.environ, PYTHONPATH=path),
+    capture_output=True,
+    text=True,
+  )
+
+
+def result(folder: Path, *args: str) -> dict:
+  done = run(folder, *args)
+  assert done.returncode == 0, done.stderr
+  return json.loads(done.stdout)
+
+
+def refusal(folder: Path, *args: str, site: Path = ROOT) -> str:
+  """Returns the last line of a command that is refused."""
+  done = run(folder, *args, site=site)
+  assert done.returncode == 2, done.stderr
+  assert "Traceback" not in done.stderr
+  return done.stderr.splitlines()[-1]
+
+
 def test_the_task_of_the_guide_runs(tmp_path: Path):
-  for folder in ("apnpql_jax", "mjcf", "experiments"):
-    skip = shutil.ignore_patterns("__pycache__", "results")
-    shutil.copytree(ROOT / folder, tmp_path / folder, ignore=skip)
-  files = blocks()
-  assert [Path(name).parent.name for name in files] == ["mjcf", "tasks", "experiments"]
-  for name, content in files.items():
-    assert not (tmp_path / name).exists()
-    (tmp_path / name).write_text(content)
+  made = result(tmp_path, "new-task", "touch_ball")
+  assert made["task"] == "touch_ball.py" and made["scene"] == "touch_ball.xml"
+  for name, content in blocks().items():
+    assert (tmp_path / name).read_text() == content
+  assert "touch_ball.py exists" in refusal(tmp_path, "new-task", "touch_ball")
 
-  def apnpql(*args: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-      [sys.executable, "-m", "apnpql_jax", *args, "--json"],
-      cwd=tmp_path,
-      env=dict(os.environ, PYTHONPATH=str(tmp_path)),
-      capture_output=True,
-      text=True,
-    )
-
-  # Neither a broken file nor a copy that keeps its name costs the other tasks anything.
-  tasks = tmp_path / "apnpql_jax" / "tasks"
-  (tasks / "broken.py").write_text("1 / 0\n")
-  shutil.copy(tasks / "push_plate.py", tasks / "a_copy.py")
-  listed = apnpql("list")
-  names = json.loads(listed.stdout)
-  assert "touch_ball" in names["tasks"] and "touch_ball" in names["presets"]
-  line = "apnpql_jax.tasks.broken is left out: ZeroDivisionError: division by zero"
-  assert listed.stderr.count(line) == 1 and len(listed.stderr.splitlines()) == 2
-  refused = apnpql("collect", "push_plate")
-  assert refused.returncode == 2 and "'push_plate'" in refused.stderr.splitlines()[-1]
-  assert "is taken by apnpql_jax.tasks.a_copy" in refused.stderr.splitlines()[-1]
-
-  collect = "collect touch_ball --episodes 32 --save mine.npz --solved-only".split()
-  figures = json.loads(apnpql(*collect).stdout)
+  file = "./touch_ball.py"
+  assert "touch_ball" in result(tmp_path, "list", file)["tasks"]
+  collect = ("collect", file, "--episodes", "32", "--save", "mine.npz", "--solved-only")
+  figures = result(tmp_path, *collect)
   assert figures["successes"] >= 31 and figures["mean_length"] < 30
   assert figures["demonstrations"] == figures["solved_demonstrations"] >= 31
-  figures = json.loads(apnpql(*collect, "--append").stdout)
+  figures = result(tmp_path, *collect, "--append")
   assert figures["demonstrations"] == figures["solved_demonstrations"] >= 62
+
+  trained = result(tmp_path, "train", file, *testing.TINY_ARGS, "--total-steps", "16")
+  assert trained["run"] == str(tmp_path / "runs" / "touch_ball-1")
+  given = ("--task-file", file)
+  evaluate = ("evaluate", "runs/touch_ball-1", "--episodes", "4")
+  resume = ("train", "--resume", "runs/touch_ball-1", "--total-steps", "32")
+  # A run alone never makes a process execute the file that it names.
+  for command in (evaluate, resume):
+    line = refusal(tmp_path, *command)
+    assert f"'touch_ball' is in {tmp_path / 'touch_ball.py'}" in line
+    assert "--task-file" in line
+  assert result(tmp_path, *evaluate, *given)["task"] == "touch_ball"
+  assert result(tmp_path, *resume, *given)["env_steps"] == 32
+  scene = tmp_path / "touch_ball.xml"
+  scene.write_text(scene.read_text().replace('size="0.03"', 'size="0.04"'))
+  done = run(tmp_path, *evaluate, *given)
+  assert "its MJCF has changed since runs/touch_ball-1 began" in done.stderr
+  (tmp_path / "touch_ball.py").rename(tmp_path / "moved.py")
+  assert "touch_ball.py, which is missing" in refusal(tmp_path, *evaluate)
+  assert "no file 'touch_ball.py'" in refusal(tmp_path, *evaluate, *given)
+
+
+def test_errors_name_the_file_and_the_line(tmp_path: Path):
+  run(tmp_path, "new-task", "mine")
+  task, scene = tmp_path / "mine.py", tmp_path / "mine.xml"
+  text, mjcf = task.read_text(), scene.read_text()
+  collect = ("collect", "mine.py", "--episodes", "2")
+
+  task.write_text(text + "\n1 / 0\n")
+  line = len(text.splitlines()) + 2
+  assert f"mine.py:{line} fails with ZeroDivisionError" in refusal(tmp_path, *collect)
+  task.write_text("def\n")
+  assert "mine.py:1 fails with SyntaxError" in refusal(tmp_path, *collect)
+  task.write_text("CONFIG = 3\n")
+  assert "'mine.py' must define CONFIG" in refusal(tmp_path, *collect)
+  task.write_text(text.replace('"mine"', '"push_plate"'))
+  line = refusal(tmp_path, *collect)
+  assert f"{task}" in line and "taken by" in line
+
+  task.write_text(text)
+  scene.write_text(mjcf.replace("<geom", "<geon"))
+  line = refusal(tmp_path, *collect)
+  assert f"{scene} does not compile" in line and "geon" in line and "line 5" in line
+  scene.unlink()
+  assert "mine" in refusal(tmp_path, *collect)
+  assert "'My Task' cannot name a task" in refusal(tmp_path, "new-task", "My Task")
+  assert "'push_plate' exists" in refusal(tmp_path, "new-task", "push_plate")
+
+
+def test_installed_packages_bring_tasks_and_presets(tmp_path: Path):
+  """A package with entry points, laid out as an installer does."""
+  site = tmp_path / "site"
+  package, info = site / "theirs", site / "theirs-1.0.dist-info"
+  package.mkdir(parents=True), info.mkdir()
+  result(tmp_path, "new-task", "touch_ball", "--folder", str(package))
+  (package / "__init__.py").touch()
+  (info / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1.0\n")
+  (info / "entry_points.txt").write_text(
+    "[apnpql.tasks]\ntouch_ball = theirs.touch_ball\nbad = theirs.missing\n"
+    "[apnpql.presets]\ntouch_ball = theirs.touch_ball:CONFIG\n"
+  )
+  listed = run(tmp_path, "list", site=site)
+  names = json.loads(listed.stdout)
+  assert "touch_ball" in names["tasks"] and "touch_ball" in names["presets"]
+  # A broken module costs the other tasks nothing but a line.
+  assert "theirs.missing is left out" in listed.stderr
+  collect = ("collect", "touch_ball", "--episodes", "8")
+  assert json.loads(run(tmp_path, *collect, site=site).stdout)["successes"] == 8

@@ -8,24 +8,41 @@ from pathlib import Path
 import re
 import subprocess
 import sys
+import textwrap
 
 from apnpql_jax import testing
 
+PAGE = (testing.ROOT / "docs" / "library.md").read_text()
+SCRIPT, GYMNASIUM, BRAX = re.findall(r"^```python\n(.*?)^```$", PAGE, re.M | re.S)
 
-def test_the_script_of_the_library_page_runs(tmp_path: Path):
-  page = (testing.ROOT / "docs" / "library.md").read_text()
-  (script,) = re.findall(r"^```python\n(.*?)^```$", page, re.M | re.S)
-  (tmp_path / "script.py").write_text(script)
+
+def output(folder: Path, script: str) -> str:
+  """Returns what a script prints in an empty folder."""
+  (folder / "script.py").write_text(script)
   done = subprocess.run(
     [sys.executable, "script.py"],
-    cwd=tmp_path,
+    cwd=folder,
     env=os.environ | {"XLA_FLAGS": testing.XLA_FLAGS, "PYTHONPATH": str(testing.ROOT)},
     capture_output=True,
     text=True,
   )
   assert done.returncode == 0, done.stderr[-2000:]
-  rewards, trained, evaluated = done.stdout.splitlines()
+  return done.stdout
+
+
+def test_the_script_of_the_library_page_runs(tmp_path: Path):
+  rewards, trained, evaluated = output(tmp_path, SCRIPT).splitlines()
   assert rewards.startswith("rewards: [")
   assert ast.literal_eval(trained)["env_steps"] == 32
   assert ast.literal_eval(evaluated)["episodes"] == 4
   assert (tmp_path / "runs" / "library" / "metrics.jsonl").exists()
+
+
+def test_the_other_interfaces_of_the_library_page_run(tmp_path: Path):
+  brax = BRAX.replace("32", "2")
+  prelude = "import jax, jax.numpy as jnp, apnpql_jax as apnpql\n"
+  body = textwrap.indent("apnpql.configure()\n" + brax + "print(state.done)\n", "  ")
+  script = GYMNASIUM.replace("num_envs=32", "num_envs=2")
+  script += f"  print(envs.reset()[0]['wrist_image'].shape)\n{body}"
+  lines = output(tmp_path, prelude + script).splitlines()
+  assert lines == ["(2, 36, 64, 3)", "[0. 0.]"]

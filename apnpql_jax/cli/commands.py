@@ -21,12 +21,12 @@ from apnpql_jax.cli.options import (
   Repeat,
   Train,
 )
-from apnpql_jax.config import files
+from apnpql_jax.config import files, user_files
 from apnpql_jax.config.checks import BACKENDS, validate
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.console import print_line
 from apnpql_jax.errors import ConfigError, check_name
-from apnpql_jax.runs import run_folder
+from apnpql_jax.runs import provenance, run_folder
 
 if TYPE_CHECKING:
   from jax.sharding import Mesh
@@ -47,7 +47,7 @@ def base_config(args: Train) -> TrainConfig:
   if args.resume is None:
     names = ", ".join(files.preset_names())
     raise ConfigError(f"train needs a preset; choose from {names}")
-  return run_folder.load_run_config(args.resume, print_line)
+  return _run_config(args.resume, args.task_file)
 
 
 def train(args: Train) -> Json:
@@ -59,7 +59,8 @@ def train(args: Train) -> Json:
     run_dir = args.resume or args.run
     if run_dir is None:
       validate(config)
-      run_dir = stack.enter_context(run_folder.new_run_dir(args.preset))
+      name = Path(args.preset).stem
+      run_dir = stack.enter_context(run_folder.new_run_dir(name))
     # ``run_training`` repeats this; here it is fast, because JAX is not imported yet.
     run_folder.check_start(run_dir, config, resume=resume, overwrite=args.overwrite)
     mesh = _mesh(args)
@@ -81,7 +82,7 @@ def train(args: Train) -> Json:
 
 def evaluate(args: Evaluate) -> Json:
   """Plays held-out episodes with a checkpoint of a run."""
-  run_dir = _existing_run(args.run, "evaluate")
+  run_dir = _existing_run(args.run, "evaluate", args.task_file)
   _check_free(args.video, overwrite=args.overwrite)
 
   from apnpql_jax.training.evaluate import evaluate as evaluate_run
@@ -99,7 +100,7 @@ def evaluate(args: Evaluate) -> Json:
 
 def diagnose(args: Diagnose) -> Json:
   """Reports what limits the success of a trained agent."""
-  run_dir = _existing_run(args.run, "diagnose")
+  run_dir = _existing_run(args.run, "diagnose", args.task_file)
 
   from apnpql_jax.training.diagnose import diagnose as diagnose_run
 
@@ -150,7 +151,7 @@ def convert(args: Convert) -> Json:
 
   devices.start()
   earlier = _earlier(out, env) if args.append else None
-  task = tasks.make_task(args.task)
+  task = tasks.make_task(env.task)
   if demonstrations.is_demonstrations(recording):
     demos = demonstrations.load(recording, task, env, allow_unsolved=True)
   else:
@@ -166,7 +167,7 @@ def repeat(args: Repeat) -> Json:
   if not args.file:
     raise ConfigError("repeat needs a file: apnpql repeat RUN/faults/step_<n>.npz")
   path = Path(args.file).absolute()
-  run_folder.load_run_config(path.parent.parent, print_line)
+  _run_config(path.parent.parent, args.task_file)
 
   from apnpql_jax import devices
   from apnpql_jax.training import skipped_updates
@@ -177,6 +178,8 @@ def repeat(args: Repeat) -> Json:
 
 def list_names(args: List) -> Json:
   """Returns the names that other commands accept, or a contact report of each task."""
+  for file in args.files:
+    user_files.load(file)
   from apnpql_jax import tasks
   from apnpql_jax.agents import table_one
 
@@ -224,12 +227,24 @@ def _mesh(args: Train) -> Mesh | None:
   return devices.make_mesh(0)
 
 
-def _existing_run(run: str, command: str) -> Path:
+def _existing_run(run: str, command: str, task_file: Path | None) -> Path:
   """Returns the folder of a run; raises ``UserError`` if it is not one."""
   if not run:
     raise ConfigError(f"{command} needs a run folder: apnpql {command} RUN")
-  run_folder.load_run_config(Path(run), print_line)
+  _run_config(Path(run), task_file)
   return Path(run)
+
+
+def _run_config(run_dir: Path, task_file: Path | None) -> TrainConfig:
+  """Returns the settings of a run, after executing the file of its task, if given."""
+  config = run_folder.load_run_config(run_dir, print_line)
+  if task_file is not None:
+    user_files.load(task_file)
+    if provenance.changed_task(run_dir, task_file):
+      print_line(f"{task_file} or its MJCF has changed since {run_dir} began")
+  elif config.env.task_file:
+    user_files.check_loaded(config.env.task_file, config.env.task)
+  return config
 
 
 def _check_demonstrations(path: Path, *, overwrite: bool, append: bool) -> None:
@@ -282,13 +297,13 @@ def _check_free(path: Path | None, *, overwrite: bool) -> None:
 
 
 def _task_env(task: str) -> EnvConfig:
-  """Returns the environment of a task's preset, or the default one for the task."""
+  """Returns the environment of a task that exists, or of the preset in its file."""
+  if user_files.is_file(task):
+    return files.load_preset(task).env
   from apnpql_jax import tasks
 
   check_name("task", task, tasks.task_names())
-  preset = task in files.preset_names()
-  env = files.load_preset(task).env if preset else EnvConfig()
-  return dataclasses.replace(env, task=task)
+  return files.task_env(task)
 
 
 def _checkpoint_step(args: Evaluate | Diagnose) -> int | None:

@@ -15,6 +15,7 @@ from apnpql_jax import __version__, errors, runtime
 from apnpql_jax.cli import commands, options
 from apnpql_jax.cli.commands import Json
 from apnpql_jax.cli.compare import Compare, compare
+from apnpql_jax.cli.new_task import NewTask, new_task
 from apnpql_jax.cli.options import Train, parse
 from apnpql_jax.cli.plot import Plot, plot
 from apnpql_jax.cli.sweep import Sweep, parse_sweep, sweep
@@ -83,7 +84,7 @@ def _parse(kind: type[Any], args: Sequence[str]) -> Any:
   if kind is not Train:
     return parse(kind, name, rest)
   # Parsing ends here for --help, which shows the settings of a preset named before it.
-  presets = [arg for arg in rest if arg in files.preset_names()]
+  presets = [arg for arg in rest if files.is_preset(arg)]
   default = Train(config=files.load_preset(presets[0])) if presets else None
   base = commands.base_config(parse(Train, name, rest, default=default))
   return parse(Train, name, rest, default=Train(config=base))
@@ -185,5 +186,6 @@ _COMMANDS: dict[str, tuple[type[Any], Callable[[Any], Json]]] = {
   "sweep": (Sweep, sweep),
   "plot": (Plot, plot),
   "compare": (Compare, compare),
+  "new-task": (NewTask, new_task),
   "list": (options.List, commands.list_names),
 }

@@ -40,6 +40,12 @@ class Command:
 
 
 @dataclasses.dataclass(frozen=True)
+class _OfRun(Command):
+  task_file: File = None
+  """Python file of the run's task, if that is not installed."""
+
+
+@dataclasses.dataclass(frozen=True)
 class _Play(Command):
   episodes: int = 200
   """Number of episodes."""
@@ -55,14 +61,15 @@ class _Play(Command):
 
 
 @dataclasses.dataclass(frozen=True)
-class Train(Command):
+class Train(_OfRun):
   """Trains an agent: apnpql train PRESET [options].
 
   Every setting of the preset can be overridden, e.g. --agent.epsilon 0.5.
   """
 
   preset: tyro.conf.Positional[str] = ""
-  """Preset to start from; `apnpql list` shows all."""
+  """Preset to start from; `apnpql list` shows all. Or the path of a file with a preset
+  and its task, such as ./my_task.py."""
 
   run: Annotated[
     Path | None, _default_hint("(default: first free runs/PRESET-<n>)")
@@ -108,7 +115,7 @@ class Train(Command):
 
 
 @dataclasses.dataclass(frozen=True)
-class Evaluate(_Play):
+class Evaluate(_Play, _OfRun):
   """Plays held-out episodes with a trained agent: apnpql evaluate RUN [options]."""
 
   run: tyro.conf.Positional[str] = ""
@@ -126,7 +133,7 @@ class Evaluate(_Play):
 
 
 @dataclasses.dataclass(frozen=True)
-class Diagnose(Command):
+class Diagnose(_OfRun):
   """Reports where and why an agent fails: apnpql diagnose RUN [options]."""
 
   run: tyro.conf.Positional[str] = ""
@@ -150,7 +157,7 @@ class Collect(_Play):
   """Plays episodes with the scripted expert: apnpql collect TASK [options]."""
 
   task: tyro.conf.Positional[str] = ""
-  """Task to play; `apnpql list` shows all."""
+  """Task to play, or the path of its file; `apnpql list` shows all."""
 
   backend: str = "auto"
   """Physics engine: auto, mjx or native."""
@@ -178,7 +185,7 @@ class Convert(Command):
   demonstrations file."""
 
   task: tyro.conf.Positional[str] = ""
-  """Task of the recording; `apnpql list` shows all."""
+  """Task of the recording, or the path of its file; `apnpql list` shows all."""
 
   out: tyro.conf.Positional[str] = ""
   """File to write, for --replay.demonstrations."""
@@ -197,7 +204,7 @@ class Convert(Command):
 
 
 @dataclasses.dataclass(frozen=True)
-class Repeat(Command):
+class Repeat(_OfRun):
   """Repeats an update with NaN or infinity: apnpql repeat RUN/faults/step_<n>.npz."""
 
   file: tyro.conf.Positional[str] = ""
@@ -206,7 +213,10 @@ class Repeat(Command):
 
 @dataclasses.dataclass(frozen=True)
 class List(Command):
-  """Lists the tasks, presets, algorithms and backends."""
+  """Lists the tasks, presets, algorithms and backends: apnpql list [FILE...]."""
+
+  files: tyro.conf.Positional[tuple[Path, ...]] = ()
+  """Python files whose tasks to list as well."""
 
   contacts: Flag = False
   """Report contacts and physics speed of every scene instead; compiles for minutes."""

@@ -39,7 +39,7 @@ class Sweep(Command):
   uses_jax: ClassVar[bool] = False
 
   presets: tyro.conf.Positional[tuple[str, ...]] = ()
-  """Presets to start from; `apnpql list` shows all."""
+  """Presets to start from, or paths of their files; `apnpql list` shows all."""
 
   grid: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
   """Values of an option, such as agent.epsilon=0.5,1,2; several make a product."""
@@ -125,7 +125,8 @@ def _open(args: Sweep, stack: contextlib.ExitStack) -> Manifest:
     _check(run)
   folder = args.out or states.find_equal(_ROOT, plan)
   if folder is None:
-    name = f"{'-'.join(args.presets)}-sweep"
+    stems = (Path(preset).stem for preset in args.presets)
+    name = f"{'-'.join(stems)}-sweep"
     folder = stack.enter_context(run_folder.new_run_dir(name, _ROOT))
   return states.open_folder(folder, plan)
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import math
 from typing import Any
 
-from apnpql_jax.config import codec
+from apnpql_jax.config import codec, user_files
 from apnpql_jax.config.ranges import validate_ranges
 from apnpql_jax.config.schema import AgentConfig, EnvConfig, TrainConfig
 from apnpql_jax.errors import ConfigError, check_name
@@ -112,6 +112,8 @@ def check_env(env: EnvConfig, *, tasks: Sequence[str] | None = None) -> None:
   """Checks the environment's settings; raises ``ConfigError`` as ``validate`` does."""
   _check_values(codec.flatten(env, "env."))
   if tasks is not None:
+    if env.task_file and env.task not in tasks:
+      user_files.check_loaded(env.task_file, env.task)
     check_name("env.task", env.task, tasks)
   if env.episode_steps < 1:
     raise ConfigError(

@@ -2,22 +2,26 @@
 
 A wheel carries ``experiments/`` and ``mjcf/`` inside the package; in a checkout they
 are next to it. Names are plain words, so that a name cannot lead out of its folder.
+
+Presets also come from files that the user names, and from installed packages, whose
+entry points in the group ``apnpql.presets`` refer to a ``TrainConfig``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 import dataclasses
-import importlib.util
+import functools
+from importlib import metadata
 import json
 from pathlib import Path
 import re
 from typing import Any
 
-from apnpql_jax.config import codec
+from apnpql_jax.config import codec, user_files
 from apnpql_jax.config.checks import validate
-from apnpql_jax.config.schema import TrainConfig
-from apnpql_jax.errors import ConfigError, check_name
+from apnpql_jax.config.schema import EnvConfig, TrainConfig
+from apnpql_jax.errors import ConfigError, check_name, one_line
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _NAME = re.compile(r"[a-z0-9][a-z0-9_]*")
@@ -25,30 +29,75 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9_]*")
 
 def preset_names() -> list[str]:
   """Returns the sorted names of the presets without executing them."""
-  return _names("experiments", ".py")
+  return sorted({*_names("experiments", ".py"), *_installed()})
+
+
+def is_preset(name: str) -> bool:
+  """Returns whether ``load_preset`` would look for a preset of this name or path."""
+  return user_files.is_file(name) or name in preset_names()
 
 
 def load_preset(name: str) -> TrainConfig:
-  """Returns the ``CONFIG`` of ``experiments/<name>.py``.
+  """Returns the settings of a preset.
+
+  Args:
+    name: A name in ``preset_names``, or the path of a Python file that defines
+      ``CONFIG`` and may register the task.
 
   Raises:
-    ConfigError: There is no such preset, or the file defines no TrainConfig.
+    ConfigError: There is no such preset, or it defines no TrainConfig.
   """
+  if user_files.is_file(name):
+    return _preset_of(Path(name))
   check_name("preset", name, preset_names())
-  path = _folder("experiments") / f"{name}.py"
-  spec = importlib.util.spec_from_file_location(f"apnpql_preset_{name}", path)
-  assert spec is not None and spec.loader is not None
-  module = importlib.util.module_from_spec(spec)
+  own = _names("experiments", ".py")
+  if name in own:
+    module = user_files.load(_folder("experiments") / f"{name}.py")
+    return _checked(name, getattr(module, "CONFIG", None))
   try:
-    spec.loader.exec_module(module)
+    return _checked(name, _installed()[name].load())
   except Exception as error:
-    raise ConfigError(
-      f"preset {name!r} fails with {type(error).__name__}: {error}"
-    ) from error
-  config = getattr(module, "CONFIG", None)
+    reason = f"{type(error).__name__}: {one_line(error)}"
+    raise ConfigError(f"preset {name!r} fails with {reason}") from error
+
+
+def _preset_of(path: Path) -> TrainConfig:
+  """Returns the preset of a file, which the settings name if it has the task, too."""
+  module = user_files.load(path)
+  config = _checked(str(path), getattr(module, "CONFIG", None))
+  classes = (value for value in vars(module).values() if isinstance(value, type))
+  if config.env.task not in (getattr(value, "name", None) for value in classes):
+    return config
+  env = dataclasses.replace(config.env, task_file=str(path.resolve()))
+  return dataclasses.replace(config, env=env)
+
+
+def _checked(name: str, config: Any) -> TrainConfig:
   if not isinstance(config, TrainConfig):
     raise ConfigError(f"preset {name!r} must define CONFIG = TrainConfig(...)")
   return config
+
+
+@functools.cache
+def _installed() -> dict[str, metadata.EntryPoint]:
+  """Returns the presets of other installed packages, by name."""
+  return {point.name: point for point in metadata.entry_points(group="apnpql.presets")}
+
+
+def preset_tasks() -> list[str]:
+  """Returns the sorted names of the tasks that have a preset of their own."""
+  return [name for name in preset_names() if name in _names("mjcf", ".xml")]
+
+
+def task_env(task: str) -> EnvConfig:
+  """Returns the environment of a task's preset, or the default one for the task."""
+  env = load_preset(task).env if task in preset_names() else EnvConfig()
+  return dataclasses.replace(env, task=task)
+
+
+def is_name(text: str) -> bool:
+  """Returns whether a preset, task or MJCF file of the package could have this name."""
+  return _NAME.fullmatch(text) is not None
 
 
 def mjcf_path(name: str) -> Path:
@@ -59,6 +108,14 @@ def mjcf_path(name: str) -> Path:
   """
   check_name("MJCF file", name, _names("mjcf", ".xml"))
   return _folder("mjcf") / f"{name}.xml"
+
+
+def mjcf_files() -> dict[str, bytes]:
+  """Returns name -> content of the package's MJCF files."""
+  folder = _folder("mjcf")
+  return {
+    f"{n}.xml": (folder / f"{n}.xml").read_bytes() for n in _names("mjcf", ".xml")
+  }
 
 
 def config_to_json(config: TrainConfig) -> str:
@@ -92,7 +149,7 @@ def format_diff(diff: dict[str, tuple[Any, Any]]) -> str:
 
 def _names(folder: str, suffix: str) -> list[str]:
   stems = (path.stem for path in _folder(folder).glob(f"*{suffix}"))
-  return sorted(stem for stem in stems if _NAME.fullmatch(stem))
+  return sorted(stem for stem in stems if is_name(stem))
 
 
 def _folder(name: str) -> Path:

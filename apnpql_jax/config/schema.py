@@ -21,6 +21,10 @@ class EnvConfig:
   task: str = "push_plate"
   """Task to solve; `apnpql list` shows all."""
 
+  task_file: str = codec.added("")
+  """Python file of the task if it is not installed. It is set from the path of the
+  preset, and the file is never executed because of it."""
+
   obs: str = "pixels"
   """Observations: pixels (two cameras) or state (points on the objects)."""
 

@@ -17,6 +17,10 @@ from apnpql_jax.types import Array
 
 FLAT = 0.002  # m; thinner geoms are marks on the table and receive shadows as it does
 
+VIEW_SIZE = (506, 674)
+"""Height and width of the view of the robot, from the camera "wide", in pixels. Next to
+it fit the global camera's image enlarged four times and the wrist's six times."""
+
 Renderer = Callable[[Kinematics], Array]
 
 

@@ -29,7 +29,7 @@ from apnpql_jax.sim import arm, engines, physics
 from apnpql_jax.sim.kinematics import Kinematics, make_kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.sim.scene import Scene
-from apnpql_jax.tasks import Task, make_task
+from apnpql_jax.tasks import Task, make_task, task_names
 from apnpql_jax.types import Array, Observation, TimeStep
 
 HISTORY = 3  # robot states stacked in an observation (paper Sec. V-A)
@@ -127,13 +127,24 @@ class Env:
 
     ``action`` is as in ``types.ACTION_DIM``; ``key`` draws the bank rows of resets.
     """
+    count = action.shape[0]
+    rows = jax.random.randint(key, (count,), 0, self.bank_split)
+    keys = jax.random.split(jax.random.fold_in(key, 1), count)
+    return self.advance_or_begin(state, action, rows, keys)
+
+  def advance_or_begin(
+    self,
+    state: EnvState,
+    action: Float[Array, "worlds 7"],
+    rows: Int[Array, " worlds"],
+    keys: PRNGKeyArray,
+  ) -> Arrival:
+    """Runs ``advance`` with given resets: a bank row and a key for each world."""
     physics_step = devices.per_device(self.physics.step, self.mesh)
     moved = physics_step(state.physics, action[:, :6], action[:, 6])
     # Reset worlds whose episode is over or whose state is broken.
     broken = ~state.timestep.last & ~self._sound(state, action, moved)
     reset = state.timestep.last | broken
-    rows = jax.random.randint(key, reset.shape, 0, self.bank_split)
-    keys = jax.random.split(jax.random.fold_in(key, 1), len(rows))
     initial = self._initial(rows, keys)
     merged = jax.tree.map(functools.partial(where_world, reset), initial, moved)
     arrival = Arrival.after(state, merged, self._bank.targets[rows], reset)
@@ -238,7 +249,7 @@ def make_env(config: EnvConfig, mesh: Mesh | None = None, *, instants: int = 0) 
     ConfigError: A setting is invalid, JAX has no device, the scene cannot be simulated
       or drawn, or too few resets are usable.
   """
-  check_env(config)
+  check_env(config, tasks=task_names())
   devices.start()
   task = make_task(config.task)
   # Fail on what the scene does not allow before building the bank.

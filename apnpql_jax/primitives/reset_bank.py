@@ -26,6 +26,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
+from apnpql_jax import tasks
 from apnpql_jax.atomic import replacing
 from apnpql_jax.console import Unfailing, print_line, reporting
 from apnpql_jax.errors import ConfigError, UserError, one_line
@@ -232,7 +233,7 @@ def _source(task: Task) -> str:
   """Returns a hash of the task's file and of the files shared by tasks."""
   own = pathlib.Path(inspect.getfile(type(task)))
   digest = hashlib.sha256(own.read_bytes())
-  for path in sorted(own.parent.glob("*.py")):
+  for path in sorted(pathlib.Path(tasks.__file__).parent.glob("*.py")):
     if "\n@register_task\n" not in (text := path.read_text(encoding="utf-8")):
       digest.update(text.encode())
   return digest.hexdigest()

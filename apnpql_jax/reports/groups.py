@@ -7,9 +7,9 @@ import re
 from typing import Any, NamedTuple
 
 from apnpql_jax.config import codec
+from apnpql_jax.config.changes import REPORTS
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.reports.reading import Run
-from apnpql_jax.runs.run_folder import MAY_CHANGE
 
 IGNORED = (
   "seed eval_every checkpoint_every keep_checkpoints save_replay_every "
@@ -85,7 +85,7 @@ def _labels(groups: Sequence[Sequence[Run]]) -> list[str]:
   """Returns a label of each group of a task; all are different."""
   values = [settings(runs[0].config) for runs in groups]
   names = differing(values)
-  learning = [name for name in names if name not in MAY_CHANGE]
+  learning = [name for name in names if name not in REPORTS]
   for chosen in (learning, names):
     labels = [_label({name: each[name] for name in chosen}) for each in values]
     if len(chosen) <= _MOST and len(set(labels)) == len(labels):

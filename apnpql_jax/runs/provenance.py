@@ -11,13 +11,14 @@ import platform
 import subprocess
 from typing import Any
 
+from apnpql_jax.config import user_files
 from apnpql_jax.runs.text import read_text, write_text
 
 FILE = "versions.json"
 
 _MAX_BYTES = 1 << 20
 
-_OF_THE_RUN = ("created", "origin", "changes")
+_OF_THE_RUN = ("created", "origin", "changes", "task_file")
 """Entries that do not describe the machine and its software."""
 
 _PACKAGES = (
@@ -73,8 +74,20 @@ def record_change(
   write(run_dir, record | {"changes": changes})
 
 
-def describe_versions(devices: int) -> dict[str, Any]:
-  """Returns versions of Python and packages, git commit of a checkout, devices."""
+def changed_task(run_dir: Path, task_file: Path) -> bool:
+  """Returns whether a task's file or MJCF differs from those that a run began with.
+
+  False if the record cannot be read, which ``changed_versions`` reports.
+  """
+  record = read(run_dir)
+  return bool(record) and record.get("task_file") != user_files.digest(task_file)
+
+
+def describe_versions(devices: int, task_file: str = "") -> dict[str, Any]:
+  """Returns versions of Python and packages, git commit of a checkout, devices.
+
+  ``task_file`` is that of ``EnvConfig``; its contents are recorded as a hash.
+  """
   import jax  # Here, so that run folders can be named without JAX.
 
   return {
@@ -83,6 +96,7 @@ def describe_versions(devices: int) -> dict[str, Any]:
     "platform": platform.platform(),
     "packages": {name: _version(name) for name in _PACKAGES},
     "git": _git(Path(__file__).parents[1]),
+    "task_file": user_files.digest(task_file) if task_file else None,
     "device": {
       "backend": jax.default_backend(),
       "kind": jax.devices()[0].device_kind,

@@ -63,7 +63,7 @@ def create(
   """
   _check_characters(run_dir, _PATTERN)
   _check_replaceable(run_dir, overwrite=overwrite)
-  versions = provenance.describe_versions(devices)
+  versions = provenance.describe_versions(devices, config.env.task_file)
   versions |= {"origin": origin} if origin else {}
   run_dir = run_dir.absolute()
   new, old = _free_name(run_dir, "new"), _free_name(run_dir, "replaced")

@@ -16,6 +16,7 @@ import mujoco
 from mujoco import mjx
 import numpy as np
 
+from apnpql_jax.config import files
 from apnpql_jax.console import print_line
 from apnpql_jax.errors import ConfigError, one_line
 from apnpql_jax.sim import scene_checks
@@ -121,14 +122,20 @@ def _compile(
   path: pathlib.Path, edit: Callable[[mujoco.MjSpec], None]
 ) -> mujoco.MjModel:
   try:
+    # A file elsewhere may include the robot and its surroundings by name.
+    shared = {
+      name: text
+      for name, text in files.mjcf_files().items()
+      if not (path.parent / name).exists()
+    }
     # MuJoCo warns of odd elements with Python's warnings, of several lines each.
     with warnings.catch_warnings(record=True, action="always") as odd:
-      spec = mujoco.MjSpec.from_file(str(path))
+      spec = mujoco.MjSpec.from_file(str(path), include=shared)
       edit(spec)
       sizes = {key.name: len(key.qpos) for key in spec.keys}
       model = spec.compile()
   except ValueError as error:
-    raise ConfigError(f"{path.name} does not compile: {one_line(error)}") from error
+    raise ConfigError(f"{path} does not compile: {one_line(error)}") from error
   for warning in odd:
     print_line(f"{path.name}: {one_line(Warning(warning.message))}")
   for name, size in sizes.items():  # MuJoCo would complete it silently.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import itertools
+from pathlib import Path
 import re
 from typing import NamedTuple
 
@@ -36,7 +37,7 @@ def make_plan(
   """Returns every combination of presets, values and seeds; seeds vary slowest.
 
   Args:
-    presets: Presets to start from.
+    presets: Names of presets, or paths of their files.
     grid: Axes as ``option=value,value``. A value of several words, as for
       ``agent.hidden``, has spaces between them.
     seeds: Number of seeds, from 0; an axis ``seed`` names them instead.
@@ -86,7 +87,7 @@ def parse_axis(text: str) -> Axis:
 def _run(
   preset: str, chosen: Sequence[tuple[Axis, str]], options: Sequence[str]
 ) -> Planned:
-  name, argv = [_plain(preset)], [preset, *options]
+  name, argv = [_plain(Path(preset).stem)], [preset, *options]
   for axis, value in chosen:
     short = axis.option.rpartition(".")[2]
     name.append(_plain(f"{short}_{value}"))

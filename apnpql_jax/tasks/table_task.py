@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+import inspect
+from pathlib import Path
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -44,19 +46,29 @@ class FreeBody(NamedTuple):
 
 
 class TableTask:
-  """Base of the tasks; the scene is ``mjcf/<name>.xml`` with a keyframe ``neutral``."""
+  """Base of the tasks.
+
+  The scene is ``<name>.xml`` next to the file of the class, or else in ``mjcf/``. It
+  has a keyframe ``neutral``.
+  """
 
   name: str
   arm_noise = 0.15  # rad; uniform spread of the initial joint angles around neutral
 
   def __init__(self, variants: Sequence[Callable[[mujoco.MjSpec], None]] = ()):
     self.scene = load_scene(
-      mjcf_path(self.name), cameras=("global", "wrist", "wide"), variants=variants
+      self._mjcf(), cameras=("global", "wrist", "wide"), variants=variants
     )
     self._neutral_qpos = self.scene.keyframe("neutral")
     neutral = jnp.asarray(self._neutral_qpos[self.scene.arm_qpos], jnp.float32)
     chain = arm.make_chain(self.scene)
     self._neutral_pos, self._neutral_mat, _ = arm.forward(chain, neutral)
+
+  @classmethod
+  def _mjcf(cls) -> Path:
+    """Returns the path of the scene."""
+    beside = Path(inspect.getfile(cls)).with_name(f"{cls.name}.xml")
+    return beside if beside.is_file() else mjcf_path(cls.name)
 
   def draw_qpos(self, rng: np.random.Generator, count: int) -> np.ndarray:
     """Draws neutral states with noise on the arm, f64[count, nq]."""

@@ -1,12 +1,17 @@
 """The interface of a task: scene, resets, success, tool targets, scripted expert.
 
-A task is one Python file, one MJCF file and one preset. Everything is batched over
+A task is a Python file, an MJCF file and a preset: in this package, in a folder of the
+user, or in an installed package whose entry points in the group ``apnpql.tasks`` name
+the module that registers it. Everything is batched over
 worlds on the first axis; positions are in m in the world frame.
 """
 
 from __future__ import annotations
 
+import functools
 import importlib
+from importlib import metadata
+import inspect
 import logging
 import pkgutil
 from typing import NamedTuple, Protocol, TypeVar
@@ -14,6 +19,7 @@ from typing import NamedTuple, Protocol, TypeVar
 from jaxtyping import Bool, Float, Int
 import numpy as np
 
+from apnpql_jax.config import user_files
 from apnpql_jax.errors import ConfigError, check_name, one_line
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.physics import PhysicsState
@@ -93,8 +99,8 @@ def register_task(task: type[T]) -> type[T]:
   holder = _REGISTRY.setdefault(task.name, task)
   if (holder.__module__, holder.__qualname__) != (task.__module__, task.__qualname__):
     raise _NameTaken(
-      f"task name {task.name!r} of {task.__module__}.{task.__qualname__} is taken by "
-      f"{holder.__module__}.{holder.__qualname__}; choose another name",
+      f"task name {task.name!r} of {_origin(task)} is taken by {_origin(holder)}; "
+      "choose another name",
       task.name,
     )
   _REGISTRY[task.name] = task
@@ -102,22 +108,23 @@ def register_task(task: type[T]) -> type[T]:
 
 
 def task_names() -> list[str]:
-  """Returns the names of all tasks, sorted; imports the modules of this package.
+  """Returns the names of all tasks, sorted; imports the modules that register them.
 
   Logs one line for a module that cannot be imported, and leaves its task out.
   """
   package = importlib.import_module("apnpql_jax.tasks")
-  for found in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
-    if found.name in _LEFT_OUT:
+  own = pkgutil.iter_modules(package.__path__, f"{package.__name__}.")
+  for name in (*(found.name for found in own), *_installed()):
+    if name in _LEFT_OUT:
       continue
     try:
-      importlib.import_module(found.name)
+      importlib.import_module(name)
     except Exception as error:  # Whatever is wrong with a file of the user.
-      _LEFT_OUT.add(found.name)
+      _LEFT_OUT.add(name)
       if isinstance(error, _NameTaken):
         _CLASHES[error.name] = str(error)
       reason = f"{type(error).__name__}: {one_line(error)}"
-      logging.getLogger(__name__).warning("%s is left out: %s", found.name, reason)
+      logging.getLogger(__name__).warning("%s is left out: %s", name, reason)
   return sorted(_REGISTRY)
 
 
@@ -131,3 +138,16 @@ def task_class(name: str) -> type[Task]:
   if name in _CLASHES:
     raise ConfigError(_CLASHES[name])
   return _REGISTRY[name]
+
+
+@functools.cache
+def _installed() -> list[str]:
+  """Returns the modules of other installed packages that register tasks."""
+  return [point.module for point in metadata.entry_points(group="apnpql.tasks")]
+
+
+def _origin(task: type[Task]) -> str:
+  """Returns the module and name of a class, or its file if that is the user's."""
+  if user_files.is_loaded(task.__module__):
+    return inspect.getfile(task)
+  return f"{task.__module__}.{task.__qualname__}"

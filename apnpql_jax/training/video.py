@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from apnpql_jax.atomic import replacing
-from apnpql_jax.envs.cameras import camera_renderer
+from apnpql_jax.envs.cameras import VIEW_SIZE, camera_renderer
 from apnpql_jax.envs.env import Env
 from apnpql_jax.training.rollout import Episodes
 
@@ -22,10 +22,6 @@ RED = (220, 60, 50)
 _GAP = 2  # black pixels between views
 _BORDER = 4  # width of a border in pixels
 _MACROBLOCK = 16  # video codecs need sides that are multiples of this
-
-VIEW_SIZE = (506, 674)
-"""Height and width of the view of the robot in pixels; both cameras fit next to it, the
-global one enlarged four times and that on the wrist six times."""
 
 HOLD = 4
 """Frames for which the last instant of an episode stays, framed in green or red."""
