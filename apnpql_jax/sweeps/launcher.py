@@ -6,6 +6,7 @@ from pathlib import Path
 import sys
 from typing import NamedTuple, Protocol
 
+from apnpql_jax.config import user_files
 from apnpql_jax.runs.run_folder import CONFIG_FILE
 
 
@@ -22,6 +23,8 @@ class Work(NamedTuple):
     run_dir = str(self.run_dir)
     begun = (self.run_dir / CONFIG_FILE).is_file()
     rest = ["--resume", run_dir] if begun else [*self.argv, "--run", run_dir]
+    if begun and user_files.is_file(self.argv[0]):
+      rest += ["--task-file", self.argv[0]]
     return [sys.executable, "-m", "apnpql_jax", "train", *rest]
 
 

@@ -267,3 +267,13 @@ def test_on_a_terminal_there_is_a_table(columns, tmp_path, monkeypatch):
   assert max(map(len, lines)) <= columns
   (row,) = [line for line in lines if "running" in line and line.split()[0] == "b"]
   assert "50 %" in row and "100 %" in row
+
+
+def test_a_run_that_has_begun_is_resumed_with_the_file_of_its_task(tmp_path: Path):
+  work = Work("a", ["./mine.py", "--seed", "1"], tmp_path, tmp_path / "log")
+  assert work.command()[3:] == ["train", *work.argv, "--run", str(tmp_path)]
+  (tmp_path / run_folder.CONFIG_FILE).touch()
+  resumed = ["train", "--resume", str(tmp_path), "--task-file", "./mine.py"]
+  assert work.command()[3:] == resumed
+  named = work._replace(argv=["push_plate"])
+  assert named.command()[3:] == resumed[:3]
