@@ -94,6 +94,7 @@ def evaluate(args: Evaluate) -> Json:
     backend=args.backend,
     step=_checkpoint_step(args),
     acting=args.acting,
+    bank_seed=args.bank_seed,
     video=args.video,
   )
 

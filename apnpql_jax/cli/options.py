@@ -128,6 +128,10 @@ class Evaluate(_Play, _OfRun):
   """How to choose an action: policy draws from the policy, mean takes the mean of its
   likeliest component, prior draws from b without Q, greedy takes the highest Q."""
 
+  bank_seed: int = 0
+  """Seed of the states that episodes start from. Another than 0 draws states on which
+  nothing was trained or chosen."""
+
   backend: Annotated[str | None, _default_hint("(default: as in training)")] = None
   """Physics engine: auto, mjx or native."""
 
