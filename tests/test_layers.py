@@ -12,7 +12,7 @@ NAME = PACKAGE.name
 
 STAIR = (
   "errors types atomic console runtime dists config devices sim render tasks "
-  "randomization primitives envs agents data runs training testing cli __main__"
+  "randomization primitives envs agents data runs training viewing testing cli __main__"
 ).split()
 """Rooms from the bottom up: each imports only from itself and from earlier ones."""
 

@@ -21,35 +21,38 @@ def _default_hint(text: str) -> object:
   return tyro.conf.arg(help_behavior_hint=text)
 
 
-_Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 _OfPreset = Annotated[str | None, _default_hint("(default: as in the preset)")]
 _Count = Annotated[int | None, _default_hint("")]
-_File = Annotated[Path | None, _default_hint("")]
+AsTrained = Annotated[str | None, _default_hint("(default: as in training)")]
+File = Annotated[Path | None, _default_hint("")]
 
 
 @dataclasses.dataclass(frozen=True)
-class _Command:
-  json: _Flag = False
+class Command:
+  """Options of all commands."""
+
+  json: Flag = False
   """Print only one JSON object on standard output."""
 
 
 @dataclasses.dataclass(frozen=True)
-class _Play(_Command):
+class _Play(Command):
   episodes: int = 200
   """Number of episodes."""
 
   seed: int = 0
   """Random seed of the episodes and of the policy or noise."""
 
-  video: _File = None
+  video: File = None
   """Also write a video of the first four episodes to this .mp4 or .gif file."""
 
-  overwrite: _Flag = False
+  overwrite: Flag = False
   """Replace files that exist."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Train(_Command):
+class Train(Command):
   """Trains an agent: apnpql train PRESET [options].
 
   Every setting of the preset can be overridden, e.g. --agent.epsilon 0.5.
@@ -63,10 +66,10 @@ class Train(_Command):
   ] = None
   """Run folder to create."""
 
-  resume: _File = None
+  resume: File = None
   """Run folder to resume from its latest checkpoint."""
 
-  overwrite: _Flag = False
+  overwrite: Flag = False
   """Replace the existing run in --run."""
 
   backend: _OfPreset = None
@@ -107,16 +110,16 @@ class Evaluate(_Play):
   checkpoint: str = "newest"
   """Checkpoint: newest, best (highest success rate in training) or its step."""
 
-  acting: Annotated[str | None, _default_hint("(default: as in training)")] = None
+  acting: AsTrained = None
   """How to choose an action: policy draws from the policy, mean takes the mean of its
   likeliest component, prior draws from b without Q, greedy takes the highest Q."""
 
-  backend: Annotated[str | None, _default_hint("(default: as in training)")] = None
+  backend: AsTrained = None
   """Physics engine: auto, mjx or native."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Diagnose(_Command):
+class Diagnose(Command):
   """Reports where and why an agent fails: apnpql diagnose RUN [options]."""
 
   run: tyro.conf.Positional[str] = ""
@@ -131,7 +134,7 @@ class Diagnose(_Command):
   seed: int = 0
   """Random seed of the episodes and of the policy."""
 
-  backend: Annotated[str | None, _default_hint("(default: as in training)")] = None
+  backend: AsTrained = None
   """Physics engine: auto, mjx or native."""
 
 
@@ -148,19 +151,19 @@ class Collect(_Play):
   noise: float = 0.0
   """Standard deviation of the noise on the expert's joint velocities (rad/s)."""
 
-  save: _File = None
+  save: File = None
   """Also record as many episodes, started from training resets, to this demonstrations
   file."""
 
-  append: _Flag = False
+  append: Flag = False
   """Add the episodes to --save if it exists."""
 
-  solved_only: _Flag = False
+  solved_only: Flag = False
   """Save only solved episodes."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Convert(_Command):
+class Convert(Command):
   """Converts a recording to demonstrations: apnpql convert REC.npz TASK OUT.npz."""
 
   recording: tyro.conf.Positional[str] = ""
@@ -173,21 +176,21 @@ class Convert(_Command):
   out: tyro.conf.Positional[str] = ""
   """File to write, for --replay.demonstrations."""
 
-  append: _Flag = False
+  append: Flag = False
   """Add the episodes to the file if it exists."""
 
-  solved_only: _Flag = False
+  solved_only: Flag = False
   """Keep only solved episodes."""
 
-  allow_unsolved: _Flag = False
+  allow_unsolved: Flag = False
   """Write a file of which no episode is solved."""
 
-  overwrite: _Flag = False
+  overwrite: Flag = False
   """Replace the file if it exists."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Repeat(_Command):
+class Repeat(Command):
   """Repeats an update with NaN or infinity: apnpql repeat RUN/faults/step_<n>.npz."""
 
   file: tyro.conf.Positional[str] = ""
@@ -195,10 +198,10 @@ class Repeat(_Command):
 
 
 @dataclasses.dataclass(frozen=True)
-class List(_Command):
+class List(Command):
   """Lists the tasks, presets, algorithms and backends."""
 
-  contacts: _Flag = False
+  contacts: Flag = False
   """Report contacts and physics speed of every scene instead; compiles for minutes."""
 
 

@@ -154,12 +154,26 @@ def load_trained(
     jnp.zeros(1, jnp.int32),
   )
   devices.check_memory(leaves.nbytes(example), "the learner")
+  learner, step = load_learner(run_dir, config, example, step)
+  return Trained(config, env, agent, learner, step)
+
+
+def load_learner(
+  run_dir: Path, config: TrainConfig, example: LearnerState, step: int | None
+) -> tuple[LearnerState, int]:
+  """Restores the learner of a checkpoint; returns it and the step.
+
+  ``example`` is a learner of the run or its shapes, ``step`` as in ``evaluate``.
+
+  Raises:
+    FileError: There is no such checkpoint, or it cannot be read.
+  """
   with abandoned_tasks.silenced():
     wanted = {"learner": example}
     found = checkpoint_reader.restore(run_dir, step, wanted, config=config)
   for line in found.damaged:
     print_line(line)
-  return Trained(config, env, agent, found.items["learner"], found.step)
+  return found.items["learner"], found.step
 
 
 def evaluate_expert(
@@ -194,8 +208,11 @@ def check_count(episodes: int, seed: int) -> None:
 def _check(episodes: int, seed: int, video: Path | str | None) -> Path | None:
   """Checks the arguments of an evaluation; returns the path of its video."""
   check_count(episodes, seed)
-  if video is None:
-    return None
+  return None if video is None else check_video(video)
+
+
+def check_video(video: Path | str) -> Path:
+  """Returns the path of a video; raises ``UserError`` if it cannot be written."""
   path = Path(video)
   if path.suffix not in (".mp4", ".gif"):
     raise ConfigError(f"video {path} must end in .mp4 or .gif")
