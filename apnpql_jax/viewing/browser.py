@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+import contextlib
 import html
+import io
 import socket
 from typing import Any
 
 import numpy as np
 
 from apnpql_jax.errors import ConfigError
-from apnpql_jax.types import PRIMITIVES
 from apnpql_jax.viewing.board import Board
 from apnpql_jax.viewing.frame import COLORS, Frame
 from apnpql_jax.viewing.session import Session
@@ -19,6 +20,8 @@ from apnpql_jax.viewing.stage import Stage
 NEWEST = "newest"
 SPEEDS = {"¼×": 0.25, "½×": 0.5, "1×": 1.0, "2×": 2.0, "4×": 4.0}
 """Label -> factor on the speed of the simulated time, as far as the machine can."""
+
+_LINES = '<div style="padding:8px 12px 2px;font-size:14px;line-height:1.7">{}</div>'
 
 PLAY, PAUSE, STEP, EPISODE = "Play", "Pause", "Step", "New episode"
 
@@ -37,7 +40,8 @@ class Browser:
     import viser
 
     actor = session.player.actor
-    server: Any = viser.ViserServer(host=host, port=port, verbose=False)
+    with contextlib.redirect_stdout(io.StringIO()):  # It prints the address in a box.
+      server: Any = viser.ViserServer(host=host, port=port, verbose=False)
     self._server, self._session = server, session
     self.url = f"http://{host}:{server.get_port()}"
     server.gui.configure_theme(
@@ -65,7 +69,7 @@ class Browser:
     with self._server.atomic():
       self._stage.show(frame)
       self._plots.image = image
-      self._headline.content = _headline(actor.title, frame)
+      self.headline.content = _headline(actor.title, frame)
 
   def offer(self, steps: list[int]) -> None:
     """See ``View.offer``."""
@@ -83,7 +87,7 @@ class Browser:
 
   def _add_controls(self) -> None:
     gui, session = self._server.gui, self._session
-    self._headline = gui.add_html("")
+    self.headline = gui.add_html(_LINES.format("preparing the first episode …"))
     self.buttons = gui.add_button_group("", (PAUSE, STEP, EPISODE))
     self.speed = gui.add_button_group("speed", [*SPEEDS])
     self.checkpoint = gui.add_dropdown("checkpoint", (NEWEST,), visible=False)
@@ -113,14 +117,12 @@ def _headline(title: str, frame: Frame) -> str:
   if frame.last:
     color, word = ("#2b8a3e", "solved") if frame.solved else ("#c92a2a", "not solved")
     state += f' <b style="color:{color}">{word}</b>'
-  likely = int(np.argmax(frame.shares))
-  whose = "expert" if frame.explanation is None else "prior"
+  color = COLORS[int(np.argmax(frame.shares))]
   badge = (
-    f'<span style="background:{COLORS[likely]};color:white;border-radius:4px;'
-    f'padding:2px 8px;font-weight:bold">{whose}: {PRIMITIVES[likely]}</span>'
+    f'<span style="background:{color};color:white;border-radius:4px;padding:2px 8px;'
+    f'font-weight:bold">{frame.headline}</span>'
   )
-  style = "padding:8px 12px 2px;font-size:14px;line-height:1.7"
-  return f'<div style="{style}">{" · ".join(parts)}<br>{badge} &nbsp; {state}</div>'
+  return _LINES.format(f"{' · '.join(parts)}<br>{badge} &nbsp; {state}")
 
 
 def check_server(host: str) -> None:

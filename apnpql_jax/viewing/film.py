@@ -15,7 +15,6 @@ from scipy.spatial import ConvexHull
 
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.training import video
-from apnpql_jax.types import PRIMITIVES
 from apnpql_jax.viewing import strips
 from apnpql_jax.viewing.frame import COLORS, Frame
 from apnpql_jax.viewing.player import Player
@@ -114,7 +113,7 @@ class Painter:
     yield axis.text(
       10,
       WIDE[0] - 14,
-      f"prior: {PRIMITIVES[likely]}" if frame.explanation else PRIMITIVES[likely],
+      frame.headline,
       fontsize=13,
       fontweight="bold",
       color="white",
@@ -124,9 +123,10 @@ class Painter:
   def _project(self, points: np.ndarray, frame: Frame) -> np.ndarray:
     """Returns the pixels (x, y) of points in the world, f64[n, 2]."""
     camera = self._scene.id("camera", "wide")
-    model, poses = self._scene.model, frame.poses
+    poses = frame.poses
+    fovy = poses.fields.get("cam_fovy", self._scene.model.cam_fovy)[camera]
     x, y, z = ((points - poses.cam_xpos[camera]) @ poses.cam_xmat[camera]).T
-    focal = 0.5 * WIDE[0] / np.tan(np.radians(model.cam_fovy[camera]) / 2)
+    focal = 0.5 * WIDE[0] / np.tan(np.radians(fovy) / 2)
     depth = np.maximum(-z, 0.01)  # m; what is behind the camera is out of the image.
     return np.c_[WIDE[1] / 2 + focal * x / depth, WIDE[0] / 2 - focal * y / depth]
 

@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 import numpy as np
 
 from apnpql_jax.agents.explanation import Explanation
+from apnpql_jax.types import PRIMITIVES
 
 COLORS = ("#e8590c", "#099268", "#7048e8")
 """Colors of the primitives object, goal and neutral, in plots and in the scene."""
@@ -69,9 +70,20 @@ class Frame:
   """Poses of all geoms, sites and cameras, ``sim.kinematics.Kinematics``."""
 
   @property
+  def guided(self) -> bool:
+    """Whether the actor has a prior with one component per primitive."""
+    prior = self.explanation.prior if self.explanation else None
+    return prior is not None and len(prior.shares) == len(PRIMITIVES)
+
+  @property
   def shares(self) -> Float[np.ndarray, " 3"]:
     """Weight of each primitive: that of the prior, or all on the expert's stage."""
-    prior = self.explanation.prior if self.explanation else None
-    if prior is not None and len(prior.shares) == len(COLORS):
-      return np.asarray(prior.shares)
-    return np.eye(len(COLORS))[self.stage]
+    if self.explanation and self.explanation.prior and self.guided:
+      return np.asarray(self.explanation.prior.shares)
+    return np.eye(len(PRIMITIVES))[self.stage]
+
+  @property
+  def headline(self) -> str:
+    """The likeliest primitive, and whose it is."""
+    likely = PRIMITIVES[int(np.argmax(self.shares))]
+    return f"{'prior' if self.guided else 'expert'}: {likely}"

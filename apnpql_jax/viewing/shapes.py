@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from apnpql_jax.envs.cameras import in_hand
+from apnpql_jax.render import Geoms
 from apnpql_jax.sim.scene import Scene
 
 _KIND = mujoco.mjtGeom
@@ -57,7 +58,8 @@ class GhostHand:
   def __init__(self, scene: Scene, sizes: np.ndarray):
     """Takes the shapes of the hand; ``sizes`` are those of all geoms, f[ngeom, 3]."""
     self._tool, model = scene.tool_site, scene.model
-    self._geoms = np.flatnonzero(in_hand(scene) & (model.geom_rgba[:, 3] > 0))
+    drawn = Geoms.from_model(model).ids
+    self._geoms = np.intersect1d(drawn, np.flatnonzero(in_hand(scene)))
     self._surfaces = [surface(model.geom_type[i], sizes[i]) for i in self._geoms]
 
   def parts(self, poses: Any) -> list[np.ndarray]:

@@ -16,6 +16,9 @@ from apnpql_jax.viewing import shapes
 from apnpql_jax.viewing.frame import COLORS, Frame
 
 _KIND = mujoco.mjtGeom
+_AMBIENT, _SUN = 1.2, 1.6
+"""Intensities at which the colors of the scene file look as in the images."""
+
 _PLANE = 3.0
 """Edge in m of the square that is drawn of a plane."""
 
@@ -28,7 +31,12 @@ class Stage:
     self._nodes, self._scene = server.scene, scene
     self._drawn, self._looks = Geoms.from_model(scene.model), b""
     server.scene.set_up_direction("+z")
-    server.scene.configure_environment_map("studio", environment_intensity=0.35)
+    server.scene.configure_environment_map(None)
+    server.scene.configure_default_lights(False)
+    server.scene.add_light_ambient("/lights/ambient", intensity=_AMBIENT)
+    server.scene.add_light_directional(
+      "/lights/sun", intensity=_SUN, position=(-0.6, -0.8, 2.0), cast_shadow=True
+    )
     _look_from(server.initial_camera, scene)
 
   def show(self, frame: Frame) -> None:

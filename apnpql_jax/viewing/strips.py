@@ -33,9 +33,7 @@ def strips_of(frame: Frame) -> list[Strip]:
   """Returns the plots that can be drawn of an episode, from top to bottom."""
   if frame.explanation is None:
     return [_EXPERT]
-  mixture = frame.explanation.prior is not None
-  primitives = mixture and len(frame.explanation.prior.shares) == len(PRIMITIVES)
-  return [_PRIOR, _TILTED, _STAGE, *_FIGURES] if primitives else [_EXPERT, *_FIGURES]
+  return [_PRIOR, _TILTED, _STAGE, *_FIGURES] if frame.guided else [_EXPERT, *_FIGURES]
 
 
 def prepare(axis: Axes, strip: Strip, limits: tuple[float, float], **show: Any) -> None:
@@ -68,9 +66,12 @@ def prepare(axis: Axes, strip: Strip, limits: tuple[float, float], **show: Any) 
 
 def legend(axis: Axes) -> None:
   """Names the colors of the primitives above the right end of the axes."""
-  place: dict[str, Any] = {"fontsize": 9, "va": "bottom", "fontweight": "bold"}
-  for name, color, x in zip(PRIMITIVES, COLORS, (0.62, 0.77, 0.87), strict=True):
-    axis.text(x, 1.04, f"■ {name}", transform=axis.transAxes, color=color, **place)
+  place: dict[str, Any] = {"ha": "right", "va": "bottom", "xycoords": "axes fraction"}
+  style: dict[str, Any] = {"fontsize": 8, "fontweight": "bold"}
+  place["textcoords"] = "offset points"
+  for name, color, left in zip(PRIMITIVES, COLORS, (92, 56, 0), strict=True):
+    offset = (-left, 3)
+    axis.annotate(f"■ {name}", (1, 1), offset, color=color, **place, **style)
 
 
 def plain(axis: Axes) -> None:

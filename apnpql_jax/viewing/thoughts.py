@@ -18,7 +18,7 @@ from apnpql_jax.viewing.strips import INK, Frames
 Box = tuple[float, float, float, float]
 """Left, top, width and height in pixels."""
 
-_GAP = 22
+_GAP = 21
 _MOST = 92.0
 """Greatest height in pixels of a strip of height one."""
 
@@ -53,7 +53,7 @@ class Strips:
     """Makes the axes for ``frames``, over ``span_s`` seconds."""
     every = strips.strips_of(frames[0])
     left, top, width, height = self._box
-    room = height - 34 - _GAP * (len(every) - 1)
+    room = height - 46 - _GAP * (len(every) - 1)
     unit = min(room / sum(strip.height for strip in every), _MOST)
     self._axes, top = [], top + 18
     for strip in every:
