@@ -10,6 +10,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
+import mujoco
 import numpy as np
 from scipy.spatial import ConvexHull
 
@@ -25,8 +26,14 @@ from apnpql_jax.viewing.thoughts import Instant, Strips, place_cameras
 SIZE = (720, 1280)
 """Height and width of a film in pixels."""
 
-WIDE = (492, 720)
-"""Height and width of the view of the scene in it."""
+WIDE = (738, 1080)
+"""Height and width of the image of the camera ``wide``, for the closest view."""
+
+_VIEW = (492, 720)
+"""Height and width of the view of the scene in a film, of the whole image or a part."""
+
+_MARGIN = 55
+"""Pixels around all that moves in the view."""
 
 _SOLVED, _FAILED = "#2b8a3e", "#c92a2a"
 _TOP = 36
@@ -43,18 +50,20 @@ class Painter:
     height, width = SIZE
     self._sheet = sheet = Sheet(width, height)
     self._pictures: dict[str, Axes] = {}
-    left, top = WIDE[1] + 24, _TOP + WIDE[0] + 6
+    left, top = _VIEW[1] + 24, _TOP + _VIEW[0] + 6
     box = (left, _TOP, width - left - 18, height - _TOP - 8)
     self._cameras = (12, top, 364, height - top - 12)
     self._strips = Strips(sheet, box, epsilon=epsilon)
-    self._instant = Instant(sheet, (392, top, WIDE[1] - 396, height - top - 4))
+    self._instant = Instant(sheet, (392, top, _VIEW[1] - 396, height - top - 4))
 
   def paint(self, frames: Sequence[Frame], count: int) -> np.ndarray:
     """Returns the image u8[*SIZE, 3] of frame ``count``, from 1, of an episode."""
     frame, span_s = frames[count - 1], frames[-1].time_s + frames[-1].period_s
+    part = self._part(frames)
 
     def prepare() -> None:
-      wide = self._sheet.picture(0, _TOP, WIDE[1], WIDE[0])
+      wide = self._sheet.picture(0, _TOP, _VIEW[1], _VIEW[0])
+      wide.set(**part)
       self._pictures = {"wide": wide} | place_cameras(self._sheet, self._cameras, frame)
       if frame.explanation is not None:
         self._instant.prepare()
@@ -62,14 +71,33 @@ class Painter:
 
     def draw() -> Iterator[Artist]:
       for name, axis in self._pictures.items():
-        yield draw_picture(axis, frame.images[name])
+        whole = (0, _VIEW[1], _VIEW[0], 0) if name == "wide" else None
+        yield draw_picture(axis, frame.images[name], whole)
       yield from self._overlay(self._pictures["wide"], frame)
       yield from self._headline(frame)
       if frame.explanation is not None:
         yield from self._instant.draw(frame)
       yield from self._strips.draw(frames[:count])
 
-    return self._sheet.image(self._strips.key(frames, span_s), prepare, draw)
+    key = (*part.values(), self._strips.key(frames, span_s))
+    return self._sheet.image(key, prepare, draw)
+
+  def _part(self, frames: Sequence[Frame]) -> dict[str, tuple[float, float]]:
+    """Returns limits of the view around the robot, the objects and the ways."""
+    moving = np.flatnonzero(self._scene.model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
+    points = [
+      self._project(
+        np.concatenate([f.poses.geom_xpos[moving], *(h.path for h in f.hands)]), f
+      )
+      for f in frames
+    ]
+    size = np.array(_VIEW[::-1])
+    low, high = (f(np.concatenate(points), axis=0) for f in (np.min, np.max))
+    low, high = low - _MARGIN, high + _MARGIN
+    zoom = np.clip((size / (high - low)).min(), 1.0, WIDE[0] / _VIEW[0])
+    left, top = np.clip((low + high - size / zoom) / 2, 0, size * (1 - 1 / zoom))
+    right, bottom = np.array([left, top]) + size / zoom
+    return {"xlim": (left, right), "ylim": (bottom, top)}
 
   def _headline(self, frame: Frame) -> Iterator[Artist]:
     text = f"{self._scene.name}   {self._title}"
@@ -80,7 +108,7 @@ class Painter:
     yield self._sheet.figure.text(0.01, s=text, color=strips.INK, **place)
     if frame.last:
       text, color = ("solved", _SOLVED) if frame.solved else ("not solved", _FAILED)
-      at = (WIDE[1] - 12) / SIZE[1]
+      at = (_VIEW[1] - 12) / SIZE[1]
       weight: Any = {"fontweight": "bold", "ha": "right"}
       yield self._sheet.figure.text(at, s=text, color=color, **place | weight)
 
@@ -111,9 +139,10 @@ class Painter:
         *way[-1], "o", color=color, markersize=4 + 3 * share, alpha=strength
       )
     yield axis.text(
-      10,
-      WIDE[0] - 14,
+      0.015,
+      0.03,
       frame.headline,
+      transform=axis.transAxes,
       fontsize=13,
       fontweight="bold",
       color="white",
@@ -126,9 +155,9 @@ class Painter:
     poses = frame.poses
     fovy = poses.fields.get("cam_fovy", self._scene.model.cam_fovy)[camera]
     x, y, z = ((points - poses.cam_xpos[camera]) @ poses.cam_xmat[camera]).T
-    focal = 0.5 * WIDE[0] / np.tan(np.radians(fovy) / 2)
+    focal = 0.5 * _VIEW[0] / np.tan(np.radians(fovy) / 2)
     depth = np.maximum(-z, 0.01)  # m; what is behind the camera is out of the image.
-    return np.c_[WIDE[1] / 2 + focal * x / depth, WIDE[0] / 2 - focal * y / depth]
+    return np.c_[_VIEW[1] / 2 + focal * x / depth, _VIEW[0] / 2 - focal * y / depth]
 
 
 def film(player: Player, path: Path, *, episodes: int) -> tuple[Path, int]:

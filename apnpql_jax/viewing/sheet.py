@@ -72,7 +72,12 @@ class Sheet:
     return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
 
-def draw_picture(axis: Axes, image: np.ndarray) -> Artist:
-  """Fills axes of ``Sheet.picture`` with an image u8[H, W, 3]."""
-  extent = (*axis.get_xlim(), *axis.get_ylim())
+def draw_picture(
+  axis: Axes, image: np.ndarray, extent: tuple[float, float, float, float] | None = None
+) -> Artist:
+  """Draws an image u8[H, W, 3] in axes of ``Sheet.picture``.
+
+  ``extent`` is its left, right, bottom and top; by default it fills the axes.
+  """
+  extent = extent or (*axis.get_xlim(), *axis.get_ylim())
   return axis.imshow(image, interpolation="nearest", aspect="auto", extent=extent)

@@ -40,8 +40,7 @@ def test_the_strips_grow_in_the_colors_of_the_weights(frames):
   assert share_of(late, heaviest) > 2 * share_of(early, heaviest) > 0
 
 
-def test_a_film_shows_every_instant(player, tmp_path, monkeypatch):
-  monkeypatch.setattr(film, "WIDE", (24, 32))
+def test_a_film_shows_every_instant(player, tmp_path):
   path, solved = film.film(player, tmp_path / "watch.mp4", episodes=2)
   images = iio.imread(path, plugin="pyav")
   episode = len(list(player.episode())) - 1 + 8  # The last instant is held.
@@ -59,7 +58,7 @@ def test_ways_of_the_primitives_begin_at_the_tool_in_the_image(frames, player):
   origin, turn = frame.poses.site_xpos[tool], frame.poses.site_xmat[tool]
   center = painter._project(np.concatenate(parts) @ turn.T + origin, frame).mean(0)
   image = frame.images["wide"]
-  column, row = center / [film.WIDE[1], film.WIDE[0]] * image.shape[1::-1]
+  column, row = center / film._VIEW[::-1] * image.shape[1::-1]
   pixel = image[int(row), int(column)].astype(int)
   table = image[-1, 0].astype(int)
   assert np.abs(pixel - table).max() > 40
@@ -87,7 +86,7 @@ def test_meshes_have_the_volume_of_their_shape(kind):
 
 
 def test_the_expert_has_a_film_without_explanations(tmp_path):
-  player = Player(scripted("random", testing.TINY.env), wide=film.WIDE)
+  player = Player(scripted("random", testing.TINY.env), wide=(24, 32))
   frames = [player.begin(), player.step()]
   painter = film.Painter(player.actor.env.task.scene, title="x", epsilon=None)
   image = painter.paint(frames, 2)
