@@ -18,7 +18,7 @@ if TYPE_CHECKING:
   from apnpql_jax.viewing.actors import Actor
 
 SCRIPTED = ("expert", "random")
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
+LOOPBACK = ("127.0.0.1", "localhost")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -136,7 +136,10 @@ class Trained(Actor):
 
 
 def scripted(what: str, env: EnvConfig) -> Actor:
-  """Returns the actor ``expert`` or ``random`` in the worlds of ``env``."""
+  """Returns the actor ``expert`` or ``random`` in the worlds of ``env``.
+
+  They see no images; the player draws them.
+  """
   kinds = {"expert": Expert, "random": Random}
   check_name("actor", what, list(kinds))
-  return kinds[what](make_env(dataclasses.replace(env, obs="pixels")))
+  return kinds[what](make_env(dataclasses.replace(env, obs="state")))

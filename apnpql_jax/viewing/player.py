@@ -106,7 +106,7 @@ class Player:
       "action": decision.action,
       "hands": self._hands(state, decision.primitives),
       "stage": expert_stage(env, state),
-      "images": {k: env.view(x, state.physics) for k, x in self._cameras.items()},
+      "images": {name: self._image(name, state) for name in self._cameras},
       "poses": env.poses(state.physics),
       "elapsed": state.elapsed,
       "solved": state.timestep.terminated,
@@ -115,6 +115,13 @@ class Player:
     }
     explanation = decision.explanation and decision.explanation.at(0)
     return decision.action, seen, explanation
+
+  def _image(self, name: str, state: EnvState) -> Array:
+    """Returns the image u8[1, H, W, 3] of a camera: the observed one, if any."""
+    observed = getattr(state.timestep.observation, f"{name}_image", None)
+    if observed is not None:
+      return observed
+    return self.actor.env.view(self._cameras[name], state.physics)
 
   def _hands(self, state: EnvState, primitives: Array) -> tuple[Array, Array, Array]:
     """Returns tool paths f32[worlds, 3, POINTS, 3], last rotations, and closing."""

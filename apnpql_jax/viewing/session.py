@@ -50,7 +50,7 @@ class Session:
 
   def step(self) -> None:
     """Asks to pause and show the next instant."""
-    self._requests.put(lambda: (self._play(False), self._advance())[0])
+    self._requests.put(self._step)
 
   def new_episode(self) -> None:
     """Asks to begin an episode."""
@@ -92,6 +92,10 @@ class Session:
   def _play(self, playing: bool) -> None:
     self.playing, self._due = playing, time.monotonic()
     self._view.state(playing=playing)
+
+  def _step(self) -> None:
+    self._play(False)
+    self._advance()
 
   def _choose(self, step: int | None) -> None:
     self._follow = step is None
