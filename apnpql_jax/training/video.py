@@ -157,11 +157,12 @@ def _encode(path: Path, frames: Iterable[np.ndarray], *, fps: float) -> None:
     stream.pix_fmt = "yuv420p"
     # Flat colors and hard edges need a rate factor below the default of 23.
     stream.options = {"crf": "10"}
-    for frame in frames:
+    for number, frame in enumerate(frames):
       _check(frame[None])
       padding = [(0, -side % _MACROBLOCK) for side in frame.shape[:2]]
       frame = np.pad(frame, (*padding, (0, 0)))
-      stream.height, stream.width = frame.shape[:2]
+      if not number:
+        stream.height, stream.width = frame.shape[:2]
       file.mux(stream.encode(av.VideoFrame.from_ndarray(frame)))
     file.mux(stream.encode())
 
