@@ -45,12 +45,12 @@ class Browser:
     self._server, self._session = server, session
     self.url = f"http://{host}:{server.get_port()}"
     server.gui.configure_theme(
-      control_layout="fixed",
       control_width="large",
       show_logo=False,
       show_share_button=False,
       brand_color=(28, 126, 214),
     )
+    server.gui.main_panel.dock_right()
     self._stage = Stage(server, actor.env.task.scene)
     self._board: Board | None = None
     self._add_controls()

@@ -25,4 +25,4 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def player(run_dir: Path) -> Player:
   """Returns a player of the run; each test begins an episode of its own."""
-  return Player(Trained(run_dir, acting="policy"), wide=(24, 32))
+  return Player(Trained(run_dir, acting="policy"), wide=(82, 120))

@@ -9,6 +9,7 @@ import pytest
 
 from apnpql_jax import testing
 from apnpql_jax.cli import main
+from apnpql_jax.envs.cameras import in_hand
 from apnpql_jax.viewing import film, shapes
 from apnpql_jax.viewing.actors import scripted
 from apnpql_jax.viewing.board import Board
@@ -48,20 +49,27 @@ def test_a_film_shows_every_instant(player, tmp_path):
   assert (images[0] != images[episode]).any()
 
 
-def test_ways_of_the_primitives_begin_at_the_tool_in_the_image(frames, player):
-  """The projection agrees with the ray caster's: the hand covers its own hull."""
+def test_the_projection_is_that_of_the_image(frames, player):
+  """Where the ghost of the hand is drawn at its present pose, the image shows it."""
   scene = player.actor.env.task.scene
   painter = film.Painter(scene, title="", epsilon=None)
-  frame = frames[0]
-  parts = shapes.GhostHand(scene, scene.model.geom_size).parts(frame.poses)
+  for frame in frames:
+    hand = frame.poses.geom_xpos[scene.id("geom", "hand")]
+    image = frame.images["wide"]
+    spot = painter._project(hand[None], frame)[0] / film._VIEW[::-1]
+    column, row = (spot * image.shape[1::-1]).astype(int)
+    assert image[row, column].max() < 80  # The hand is dark, the table is light.
+    assert image[-1, 0].min() > 150
+
+
+def test_a_ghost_in_the_present_pose_covers_the_hand(frames, player):
+  scene, frame = player.actor.env.task.scene, frames[0]
+  ghost = shapes.GhostHand(scene, scene.model.geom_size)
   tool = scene.tool_site
   origin, turn = frame.poses.site_xpos[tool], frame.poses.site_xmat[tool]
-  center = painter._project(np.concatenate(parts) @ turn.T + origin, frame).mean(0)
-  image = frame.images["wide"]
-  column, row = center / film._VIEW[::-1] * image.shape[1::-1]
-  pixel = image[int(row), int(column)].astype(int)
-  table = image[-1, 0].astype(int)
-  assert np.abs(pixel - table).max() > 40
+  centers = [part.mean(0) @ turn.T + origin for part in ghost.parts(frame.poses)]
+  expected = frame.poses.geom_xpos[np.flatnonzero(in_hand(scene))]
+  np.testing.assert_allclose(centers, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX"])
