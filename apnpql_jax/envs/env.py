@@ -176,7 +176,11 @@ class Env:
     self, renderer: Renderer, state: PhysicsState
   ) -> UInt8[Array, "worlds H W 3"]:
     """Renders the worlds through another camera, for videos."""
-    return renderer(self._kinematics(state))
+    return renderer(self.poses(state))
+
+  def poses(self, state: PhysicsState) -> Kinematics:
+    """Returns the poses of geoms, sites and cameras in the world."""
+    return self._kinematics(state)
 
   def _repeated(self, x: Array) -> Array:
     """Repeats L times, [worlds, ...] -> [worlds, L, ...]."""

@@ -176,15 +176,27 @@ def load_trained(
   agent = make_agent(config.agent)
   shapes = observation_shapes(config.env, env.task, instants=instants)
   learner = jax.eval_shape(agent.init, jax.random.key(0), shapes)
-  example = {"target_params": learner.target_params}
-  devices.check_memory(leaves.nbytes(example), "the network")
+  devices.check_memory(leaves.nbytes(learner.target_params), "the network")
+  params, step = load_params(run_dir, config, learner.target_params, step)
+  return Trained(config, env, agent, params, step)
+
+
+def load_params(
+  run_dir: Path, config: TrainConfig, example: Params, step: int | None
+) -> tuple[Params, int]:
+  """Restores the weights that act from a checkpoint; returns them and the step.
+
+  ``example`` are weights of the run or their shapes, ``step`` is as in ``evaluate``.
+
+  Raises:
+    FileError: There is no such checkpoint, or it cannot be read.
+  """
   with abandoned_tasks.silenced():
-    wanted = {"learner": example}
+    wanted = {"learner": {"target_params": example}}
     found = checkpoint_reader.restore(run_dir, step, wanted, config=config, partly=True)
   for line in found.damaged:
     print_line(line)
-  params = found.items["learner"]["target_params"]
-  return Trained(config, env, agent, params, found.step)
+  return found.items["learner"]["target_params"], found.step
 
 
 def evaluate_expert(
@@ -219,8 +231,11 @@ def check_count(episodes: int, seed: int) -> None:
 def _check(episodes: int, seed: int, video: Path | str | None) -> Path | None:
   """Checks the arguments of an evaluation; returns the path of its video."""
   check_count(episodes, seed)
-  if video is None:
-    return None
+  return None if video is None else check_video(video)
+
+
+def check_video(video: Path | str) -> Path:
+  """Returns the path of a video; raises ``UserError`` if it cannot be written."""
   path = Path(video)
   if path.suffix not in (".mp4", ".gif"):
     raise ConfigError(f"video {path} must end in .mp4 or .gif")
