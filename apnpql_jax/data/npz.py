@@ -35,6 +35,8 @@ def read(path: Path, *, limit: int) -> dict[str, np.ndarray]:
       return {name.removesuffix(".npy"): _array(archive, name) for name in names}
   except UserError:
     raise
+  except OSError as error:  # Missing, a folder, or not readable.
+    raise FileError(f"cannot read {path}: {error.strerror or error}") from None
   except _ERRORS as error:
     raise FileError(f"{path} is not an .npz archive: {one_line(error)}") from None
 

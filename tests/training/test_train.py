@@ -65,7 +65,7 @@ def changed(**settings: object) -> TrainConfig:
       changed(replay=dataclasses.replace(testing.TINY.replay, demonstrations="none")),
       {},
       FileError,
-      "none is not an .npz archive",
+      "cannot read none: No such file",
     ),
     (
       changed(env=dataclasses.replace(testing.TINY.env, control_period_s=0.151)),
