@@ -21,6 +21,10 @@ class NewTask:
   """Writes the files of a new task: apnpql new-task NAME.
 
   NAME.py and NAME.xml are a complete task to change: touching a ball.
+
+  apnpql new-task my_task
+
+  apnpql new-task my_task --folder tasks
   """
 
   name: tyro.conf.Positional[str] = ""

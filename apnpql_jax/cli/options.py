@@ -65,6 +65,10 @@ class Train(_OfRun):
   """Trains an agent: apnpql train PRESET [options].
 
   Every setting of the preset can be overridden, e.g. --agent.epsilon 0.5.
+
+  apnpql train push_plate --seed 1 --run runs/mine
+
+  apnpql train --resume runs/mine
   """
 
   preset: tyro.conf.Positional[str] = ""
@@ -116,7 +120,12 @@ class Train(_OfRun):
 
 @dataclasses.dataclass(frozen=True)
 class Evaluate(_Play, _OfRun):
-  """Plays held-out episodes with a trained agent: apnpql evaluate RUN [options]."""
+  """Plays held-out episodes with a trained agent: apnpql evaluate RUN [options].
+
+  apnpql evaluate runs/mine --episodes 200 --seed 7
+
+  apnpql evaluate runs/mine --checkpoint best --video best.mp4
+  """
 
   run: tyro.conf.Positional[str] = ""
   """Run folder."""
@@ -134,7 +143,12 @@ class Evaluate(_Play, _OfRun):
 
 @dataclasses.dataclass(frozen=True)
 class Diagnose(_OfRun):
-  """Reports where and why an agent fails: apnpql diagnose RUN [options]."""
+  """Reports where and why an agent fails: apnpql diagnose RUN [options].
+
+  apnpql diagnose runs/mine
+
+  apnpql diagnose runs/mine --checkpoint best --episodes 128
+  """
 
   run: tyro.conf.Positional[str] = ""
   """Run folder."""
@@ -154,7 +168,12 @@ class Diagnose(_OfRun):
 
 @dataclasses.dataclass(frozen=True)
 class Collect(_Play):
-  """Plays episodes with the scripted expert: apnpql collect TASK [options]."""
+  """Plays episodes with the scripted expert: apnpql collect TASK [options].
+
+  apnpql collect push_plate --video expert.mp4
+
+  apnpql collect push_plate --episodes 200 --noise 0.03 --save mine.npz
+  """
 
   task: tyro.conf.Positional[str] = ""
   """Task to play, or the path of its file; `apnpql list` shows all."""
@@ -178,7 +197,12 @@ class Collect(_Play):
 
 @dataclasses.dataclass(frozen=True)
 class Convert(Command):
-  """Converts a recording to demonstrations: apnpql convert REC.npz TASK OUT.npz."""
+  """Converts a recording to demonstrations: apnpql convert REC.npz TASK OUT.npz.
+
+  apnpql convert recording.npz push_plate mine.npz
+
+  apnpql convert other.npz push_plate mine.npz --append --solved-only
+  """
 
   recording: tyro.conf.Positional[str] = ""
   """Joint trajectories and object poses (docs/demonstrations.md), or another
@@ -205,7 +229,12 @@ class Convert(Command):
 
 @dataclasses.dataclass(frozen=True)
 class Repeat(_OfRun):
-  """Repeats an update with NaN or infinity: apnpql repeat RUN/faults/step_<n>.npz."""
+  """Repeats an update with NaN or infinity: apnpql repeat RUN/faults/step_<n>.npz.
+
+  apnpql repeat runs/mine/faults/step_00001024.npz
+
+  apnpql repeat runs/mine/faults/step_00001024.npz --task-file my_task.py
+  """
 
   file: tyro.conf.Positional[str] = ""
   """File that a run wrote when it stopped, still in its run folder."""
@@ -213,7 +242,12 @@ class Repeat(_OfRun):
 
 @dataclasses.dataclass(frozen=True)
 class List(Command):
-  """Lists the tasks, presets, algorithms and backends: apnpql list [FILE...]."""
+  """Lists the tasks, presets, algorithms and backends: apnpql list [FILE...].
+
+  apnpql list --json
+
+  apnpql list my_task.py --contacts
+  """
 
   files: tyro.conf.Positional[tuple[Path, ...]] = ()
   """Python files whose tasks to list as well."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+import contextlib
+import datetime
 import sys
 import time
 from typing import Any, TextIO
@@ -12,18 +14,24 @@ from apnpql_jax.console import Unfailing
 _SPEED_PERIOD_S = 600.0
 """Speeds are averaged over this time, which has to span several slow iterations."""
 
+_UNKNOWN = "-:--:--"
+"""Time left before there is a speed."""
+
 
 class TrainProgress:
   """Display of success rate, speeds and time left.
 
   Use as a context manager. Speeds count from the first update on, so that the first
-  compilation does not lower them.
+  compilation does not lower them, and leave evaluations out. The time left is that of
+  the steps, checkpoints included, plus one evaluation each at the shortest time that
+  one has taken: the first one also compiles. Before the first, it is that of the steps.
   """
 
   def __init__(
     self,
     total_steps: int,
     *,
+    eval_every: int | None = None,
     stream: TextIO | None = None,
     period_s: float = 15.0,
     clock: Callable[[], float] = time.monotonic,
@@ -31,25 +39,28 @@ class TrainProgress:
     """Builds the display without showing it.
 
     Without a terminal, a line is printed every ``period_s`` seconds. ``stream`` is
-    standard error if None.
+    standard error if None. There is an evaluation every ``eval_every`` steps and at the
+    end, or none.
     """
     from rich import console, progress
 
     unfailing: Any = Unfailing(stream or sys.stderr)
     self._period, self._clock = period_s, clock
+    self._total, self._eval_every = total_steps, eval_every
+    self._evaluations: list[float] = []  # seconds
+    self._evaluating = False
     text = "{task.completed:,} steps  {task.fields[figures]}"
-    self._time_left = progress.TimeRemainingColumn()
     self._bar = progress.Progress(
       progress.BarColumn(bar_width=24),
       progress.TaskProgressColumn(),
       progress.TextColumn(text, markup=False),
-      self._time_left,
+      progress.TextColumn("{task.fields[left]} left", style="progress.remaining"),
       console=console.Console(file=unfailing),
       speed_estimate_period=_SPEED_PERIOD_S,
-      get_time=clock,
+      get_time=lambda: clock() - sum(self._evaluations),
       disable=not unfailing.isatty(),
     )
-    self._bar.add_task("steps", total=total_steps, figures="starting")
+    self._bar.add_task("steps", total=total_steps, figures="starting", left=_UNKNOWN)
     self._bar.add_task("updates", total=None, visible=False)
     self._steps, self._updates = self._bar.tasks
     self._success: float | None = None
@@ -76,15 +87,48 @@ class TrainProgress:
       self._success = success_rate
     self._bar.update(self._updates.id, completed=updates)
     self._bar.update(self._steps.id, completed=step)
-    self._bar.update(self._steps.id, figures=self._figures())
+    self._show()
     if self._bar.disable:
       self._unprinted = True
       if self._clock() - self._printed_at >= self._period:
         self._print_line()
 
+  @contextlib.contextmanager
+  def evaluation(self) -> Generator[None, None, None]:
+    """Measures an evaluation, which is the block."""
+    began, self._evaluating = self._clock(), True
+    self._show()
+    try:
+      yield
+    finally:
+      self._evaluating = False
+      self._evaluations.append(self._clock() - began)
+      self._show()
+
   def message(self, text: str) -> None:
     """Prints a line that stays, above the bar."""
     self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+  def _show(self) -> None:
+    """Updates what the bar shows next to the steps."""
+    self._bar.update(self._steps.id, figures=self._figures(), left=self._left())
+
+  def _left(self) -> str:
+    """Returns the time left as hours, minutes and seconds."""
+    seconds = self._steps.time_remaining
+    if seconds is None:
+      return _UNKNOWN
+    if self._evaluations:
+      seconds += min(self._evaluations) * self._evaluations_left()
+    return str(datetime.timedelta(seconds=round(seconds)))
+
+  def _evaluations_left(self) -> int:
+    """Returns the number of evaluations to come, the present one included."""
+    if self._eval_every is None:
+      return 0
+    step, every = int(self._steps.completed), self._eval_every
+    at_end = step < self._total and self._total % every > 0
+    return max(self._total // every - step // every, 0) + at_end + self._evaluating
 
   def _figures(self) -> str:
     success = "--" if self._success is None else f"{100 * self._success:.0f} %"
@@ -99,6 +143,6 @@ class TrainProgress:
     steps = self._steps
     self.message(
       f"step {steps.completed:,} of {steps.total:,} ({steps.percentage:.0f} %)  "
-      f"{steps.fields['figures']}  {self._time_left.render(steps)} left"
+      f"{steps.fields['figures']}  {steps.fields['left']} left"
     )
     self._printed_at, self._unprinted = self._clock(), False
