@@ -38,7 +38,7 @@ def checked(
   try:
     return list(check())
   except Exception as error:  # Whatever a broken machine makes a library raise.
-    text = f"{type(error).__name__}: {one_line(error)}"
+    text = ": ".join(dict.fromkeys((type(error).__name__, one_line(error))))
     cure = cure or f"mend what {name!r} reports"
     return [Finding(section, name, text, cure, broken=True)]
 
