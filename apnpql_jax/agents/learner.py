@@ -18,6 +18,7 @@ from apnpql_jax.agents.acting import choose_action
 from apnpql_jax.agents.augmentation import augment
 from apnpql_jax.agents.columns.candidates import Candidates
 from apnpql_jax.agents.columns.policy_evaluation import PolicyEvaluation
+from apnpql_jax.agents.explanation import Explanation, explain
 from apnpql_jax.agents.networks import Heads, Networks, Params, make_networks
 from apnpql_jax.agents.table_one import Algorithm, algorithm_of, epsilon_bounds
 from apnpql_jax.config.checks import check_agent
@@ -74,6 +75,9 @@ class Agent:
   ]
   """(state, transitions [B], key) -> state after one update, metrics f32[]."""
 
+  explain: Callable[..., Explanation]
+  """As ``act``, but returns what led to the action, see ``Explanation``."""
+
 
 def make_agent(config: AgentConfig) -> Agent:
   """Builds the agent that ``config`` describes.
@@ -108,6 +112,16 @@ def make_agent(config: AgentConfig) -> Agent:
     heads = networks.at(params, observation)
     return choose_action(algorithm, heads, key, acting=acting)
 
+  def explained(
+    params: Params,
+    observation: Observation,
+    key: PRNGKeyArray,
+    *,
+    acting: str = "policy",
+  ) -> Explanation:
+    heads = networks.at(params, observation)
+    return explain(algorithm, heads, key, acting=acting)
+
   def update(
     state: LearnerState, batch: Transition, key: PRNGKeyArray
   ) -> tuple[LearnerState, Metrics]:
@@ -132,7 +146,7 @@ def make_agent(config: AgentConfig) -> Agent:
     metrics |= {f"grad_norm/{k}": optax.tree.norm(grads[k]) for k in groups}
     return after, metrics | {"prior/nu": after.nu}
 
-  return Agent(networks, evaluation, init, act, update)
+  return Agent(networks, evaluation, init, act, update, explained)
 
 
 def make_optimizer(

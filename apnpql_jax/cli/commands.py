@@ -47,7 +47,7 @@ def base_config(args: Train) -> TrainConfig:
   if args.resume is None:
     names = ", ".join(files.preset_names())
     raise ConfigError(f"train needs a preset; choose from {names}")
-  return _run_config(args.resume, args.task_file)
+  return run_config(args.resume, args.task_file)
 
 
 def train(args: Train) -> Json:
@@ -83,7 +83,7 @@ def train(args: Train) -> Json:
 def evaluate(args: Evaluate) -> Json:
   """Plays held-out episodes with a checkpoint of a run."""
   run_dir = _existing_run(args.run, "evaluate", args.task_file)
-  _check_free(args.video, overwrite=args.overwrite)
+  check_free(args.video, overwrite=args.overwrite)
 
   from apnpql_jax.training.evaluate import evaluate as evaluate_run
 
@@ -92,8 +92,9 @@ def evaluate(args: Evaluate) -> Json:
     episodes=args.episodes,
     seed=args.seed,
     backend=args.backend,
-    step=_checkpoint_step(args),
+    step=checkpoint_step(args.run, args.checkpoint),
     acting=args.acting,
+    bank_seed=args.bank_seed,
     video=args.video,
   )
 
@@ -109,19 +110,19 @@ def diagnose(args: Diagnose) -> Json:
     episodes=args.episodes,
     seed=args.seed,
     backend=args.backend,
-    step=_checkpoint_step(args),
+    step=checkpoint_step(args.run, args.checkpoint),
   )
 
 
 def collect(args: Collect) -> Json:
   """Plays episodes with the scripted expert of a task."""
-  _check_free(args.video, overwrite=args.overwrite)
+  check_free(args.video, overwrite=args.overwrite)
   if args.save is None and (args.append or args.solved_only):
     raise ConfigError("--append and --solved-only need --save FILE.npz")
   if args.save is not None:
     _check_demonstrations(args.save, overwrite=args.overwrite, append=args.append)
   # The expert acts on privileged poses, so images are not needed.
-  env = dataclasses.replace(_task_env(args.task), backend=args.backend, obs="state")
+  env = dataclasses.replace(task_env(args.task), backend=args.backend, obs="state")
 
   from apnpql_jax.envs.env import make_env
   from apnpql_jax.training import expert
@@ -144,7 +145,7 @@ def convert(args: Convert) -> Json:
   _check_demonstrations(out, overwrite=args.overwrite, append=args.append)
   if args.append and recording.resolve() == out.resolve():
     raise ConfigError(f"{out} cannot be added to itself")
-  env = _task_env(args.task)
+  env = task_env(args.task)
 
   from apnpql_jax import devices, tasks
   from apnpql_jax.data import demonstrations, real_arm
@@ -167,7 +168,7 @@ def repeat(args: Repeat) -> Json:
   if not args.file:
     raise ConfigError("repeat needs a file: apnpql repeat RUN/faults/step_<n>.npz")
   path = Path(args.file).absolute()
-  _run_config(path.parent.parent, args.task_file)
+  run_config(path.parent.parent, args.task_file)
 
   from apnpql_jax import devices
   from apnpql_jax.training import skipped_updates
@@ -231,11 +232,11 @@ def _existing_run(run: str, command: str, task_file: Path | None) -> Path:
   """Returns the folder of a run; raises ``UserError`` if it is not one."""
   if not run:
     raise ConfigError(f"{command} needs a run folder: apnpql {command} RUN")
-  _run_config(Path(run), task_file)
+  run_config(Path(run), task_file)
   return Path(run)
 
 
-def _run_config(run_dir: Path, task_file: Path | None) -> TrainConfig:
+def run_config(run_dir: Path, task_file: Path | None) -> TrainConfig:
   """Returns the settings of a run, after executing the file of its task, if given."""
   config = run_folder.load_run_config(run_dir, print_line)
   if task_file is not None:
@@ -254,7 +255,7 @@ def _check_demonstrations(path: Path, *, overwrite: bool, append: bool) -> None:
   if path.is_dir() or not path.absolute().parent.is_dir():
     raise ConfigError(f"{path} is a folder, or in none; name a file to write")
   check_writable(path.absolute().parent)
-  _check_free(path, overwrite=overwrite or append)
+  check_free(path, overwrite=overwrite or append)
 
 
 def _earlier(path: Path, env: EnvConfig) -> Demonstrations | None:
@@ -290,13 +291,13 @@ def _save(
   return counts | {"solved_demonstrations": solved}
 
 
-def _check_free(path: Path | None, *, overwrite: bool) -> None:
+def check_free(path: Path | None, *, overwrite: bool) -> None:
   """Raises ``ConfigError`` if a file exists and must not be replaced."""
   if path is not None and path.is_file() and not overwrite:
     raise ConfigError(f"{path} exists; replace it with --overwrite, or name another")
 
 
-def _task_env(task: str) -> EnvConfig:
+def task_env(task: str) -> EnvConfig:
   """Returns the environment of a task that exists, or of the preset in its file."""
   if user_files.is_file(task):
     return files.load_preset(task).env
@@ -306,16 +307,16 @@ def _task_env(task: str) -> EnvConfig:
   return files.task_env(task)
 
 
-def _checkpoint_step(args: Evaluate | Diagnose) -> int | None:
+def checkpoint_step(run: str, checkpoint: str) -> int | None:
   """Returns the step of the checkpoint asked for; None for the newest."""
-  if args.checkpoint == "newest":
+  if checkpoint == "newest":
     return None
-  if args.checkpoint == "best":
+  if checkpoint == "best":
     from apnpql_jax.runs.checkpoint_reader import best_step
 
-    return best_step(Path(args.run))
-  if args.checkpoint.isdecimal() and len(args.checkpoint) < 20:
-    return int(args.checkpoint)
+    return best_step(Path(run))
+  if checkpoint.isdecimal() and len(checkpoint) < 20:
+    return int(checkpoint)
   raise ConfigError(
-    f"unknown --checkpoint {args.checkpoint!r}; choose from newest, best, or a step"
+    f"unknown --checkpoint {checkpoint!r}; choose from newest, best, or a step"
   )

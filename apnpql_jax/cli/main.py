@@ -12,7 +12,7 @@ import sys
 from typing import Any
 
 from apnpql_jax import __version__, errors, runtime
-from apnpql_jax.cli import commands, options, text
+from apnpql_jax.cli import commands, options, text, watch
 from apnpql_jax.cli.commands import Json
 from apnpql_jax.cli.compare import Compare, compare
 from apnpql_jax.cli.completion import Completion, completion
@@ -188,6 +188,7 @@ _COMMANDS: dict[str, tuple[type[Any], Callable[[Any], Json]]] = {
   "train": (Train, commands.train),
   "evaluate": (options.Evaluate, commands.evaluate),
   "diagnose": (options.Diagnose, commands.diagnose),
+  "watch": (watch.Watch, watch.watch),
   "collect": (options.Collect, commands.collect),
   "convert": (options.Convert, commands.convert),
   "repeat": (options.Repeat, commands.repeat),

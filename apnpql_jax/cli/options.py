@@ -25,6 +25,7 @@ def _default_hint(text: str) -> object:
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 _OfPreset = Annotated[str | None, _default_hint("(default: as in the preset)")]
 Count = Annotated[int | None, _default_hint("")]
+AsTrained = Annotated[str | None, _default_hint("(default: as in training)")]
 File = Annotated[Path | None, _default_hint("")]
 
 
@@ -40,7 +41,9 @@ class Command:
 
 
 @dataclasses.dataclass(frozen=True)
-class _OfRun(Command):
+class OfRun(Command):
+  """Options of commands that read a run."""
+
   task_file: File = None
   """Python file of the run's task, if that is not installed."""
 
@@ -61,7 +64,7 @@ class _Play(Command):
 
 
 @dataclasses.dataclass(frozen=True)
-class Train(_OfRun):
+class Train(OfRun):
   """Trains an agent: apnpql train PRESET [options].
 
   Every setting of the preset can be overridden, e.g. --agent.epsilon 0.5.
@@ -119,7 +122,7 @@ class Train(_OfRun):
 
 
 @dataclasses.dataclass(frozen=True)
-class Evaluate(_Play, _OfRun):
+class Evaluate(_Play, OfRun):
   """Plays held-out episodes with a trained agent: apnpql evaluate RUN [options].
 
   apnpql evaluate runs/mine --episodes 200 --seed 7
@@ -133,16 +136,20 @@ class Evaluate(_Play, _OfRun):
   checkpoint: str = "newest"
   """Checkpoint: newest, best (highest success rate in training) or its step."""
 
-  acting: Annotated[str | None, _default_hint("(default: as in training)")] = None
+  acting: AsTrained = None
   """How to choose an action: policy draws from the policy, mean takes the mean of its
   likeliest component, prior draws from b without Q, greedy takes the highest Q."""
 
-  backend: Annotated[str | None, _default_hint("(default: as in training)")] = None
+  bank_seed: int = 0
+  """Seed of the states that episodes start from. Another than 0 draws states on which
+  nothing was trained or chosen."""
+
+  backend: AsTrained = None
   """Physics engine: auto, mjx or native."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Diagnose(_OfRun):
+class Diagnose(OfRun):
   """Reports where and why an agent fails: apnpql diagnose RUN [options].
 
   apnpql diagnose runs/mine
@@ -162,7 +169,7 @@ class Diagnose(_OfRun):
   seed: int = 0
   """Random seed of the episodes and of the policy."""
 
-  backend: Annotated[str | None, _default_hint("(default: as in training)")] = None
+  backend: AsTrained = None
   """Physics engine: auto, mjx or native."""
 
 
@@ -228,7 +235,7 @@ class Convert(Command):
 
 
 @dataclasses.dataclass(frozen=True)
-class Repeat(_OfRun):
+class Repeat(OfRun):
   """Repeats an update with NaN or infinity: apnpql repeat RUN/faults/step_<n>.npz.
 
   apnpql repeat runs/mine/faults/step_00001024.npz

@@ -68,8 +68,18 @@ class GripperGMM(ActionDistribution):
 
   def log_prob(self, value: Float[Array, "*sb d+1"]) -> Float[Array, "*sb"]:
     """Returns the log density of unclipped actions."""
+    total = jax.nn.logsumexp(self._log_joint(value), axis=-2)
+    return self._samples_first(total, value)
+
+  def responsibilities(self, value: Float[Array, "*sb d+1"]) -> Float[Array, "*sb k"]:
+    """Returns the probability that each component drew the unclipped actions."""
+    shares = jax.nn.softmax(self._log_joint(value), axis=-2)
+    shares = [self._samples_first(x, value) for x in jnp.moveaxis(shares, -2, 0)]
+    return jnp.stack(shares, axis=-1)
+
+  def _log_joint(self, value: Float[Array, "*sb d+1"]) -> Float[Array, "*b k n"]:
+    """Returns log weight plus log density of each component at each of n samples."""
     batch = self.logits.shape[:-1]
-    lead = value.shape[: value.ndim - 1 - len(batch)]
     # Move the samples behind the batch, as batched matrix products want them.
     samples = jnp.moveaxis(value.reshape(-1, *batch, value.shape[-1]), 0, -2)
     arm, gripper = samples[..., None, :, :-1], samples[..., None, :, -1]
@@ -81,8 +91,13 @@ class GripperGMM(ActionDistribution):
     odds = self.gripper_logits[..., None]
     bernoulli = gripper * odds - jax.nn.softplus(odds)
     log_weights = jnp.asarray(self.choice.logits)[..., None]
-    total = jax.nn.logsumexp(log_weights + gaussian + bernoulli, axis=-2)
-    return jnp.moveaxis(total, -1, 0).reshape(*lead, *batch)
+    return log_weights + gaussian + bernoulli
+
+  def _samples_first(
+    self, x: Float[Array, "*b n"], value: Float[Array, "*sb d+1"]
+  ) -> Float[Array, "*sb"]:
+    """Moves the n samples of ``value`` back before the batch."""
+    return jnp.moveaxis(x, -1, 0).reshape(value.shape[:-1])
 
   def entropy(self) -> Float[Array, "*b"]:
     """Returns the entropy of one component in nats; several have no closed form."""

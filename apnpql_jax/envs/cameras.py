@@ -54,12 +54,9 @@ def camera_renderer(
 
 def shadows_of_the_hand(scene: Scene, geoms: Geoms) -> dict[str, Any]:
   """Returns the ``Lighting`` settings for the hand's shadow on table and flat marks."""
-  model, hand = scene.model, scene.id("body", "gripper")
-  in_hand = np.zeros(model.nbody, bool)
-  for body in range(hand, model.nbody):  # Parents have lower ids.
-    in_hand[body] = body == hand or in_hand[model.body_parentid[body]]
+  model = scene.model
   body, kind = model.geom_bodyid[geoms.ids], geoms.types
-  casts = in_hand[body] & np.isin(kind, list(SHADOWS))
+  casts = in_hand(scene)[geoms.ids] & np.isin(kind, list(SHADOWS))
   # What cannot move by itself, and is flat, receives the shadow.
   still = (model.body_rootid[body] == 0) | (model.body_mocapid[body] >= 0)
   shapes = mujoco.mjtGeom
@@ -71,3 +68,12 @@ def shadows_of_the_hand(scene: Scene, geoms: Geoms) -> dict[str, Any]:
   receives = still & (2 * half_height < FLAT)
   casters, receivers = (tuple(geoms.ids[x].tolist()) for x in (casts, receives))
   return {"shadow_casters": casters, "shadow_receivers": receivers}
+
+
+def in_hand(scene: Scene) -> np.ndarray:
+  """Returns which geoms belong to the gripper, bool[ngeom]."""
+  model, hand = scene.model, scene.id("body", "gripper")
+  bodies = np.zeros(model.nbody, bool)
+  for body in range(hand, model.nbody):  # Parents have lower ids.
+    bodies[body] = body == hand or bodies[model.body_parentid[body]]
+  return bodies[model.geom_bodyid]

@@ -22,8 +22,8 @@ from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.envs.cameras import Renderer, make_cameras
 from apnpql_jax.envs.state import Arrival, EnvState, where_world
 from apnpql_jax.errors import ConfigError
-from apnpql_jax.primitives import tracking
-from apnpql_jax.primitives.reset_bank import ResetBank, load_bank
+from apnpql_jax.primitives import reset_bank, tracking
+from apnpql_jax.primitives.reset_bank import ResetBank
 from apnpql_jax.randomization.randomize import make_randomize
 from apnpql_jax.sim import arm, engines, physics
 from apnpql_jax.sim.kinematics import Kinematics, make_kinematics
@@ -176,7 +176,11 @@ class Env:
     self, renderer: Renderer, state: PhysicsState
   ) -> UInt8[Array, "worlds H W 3"]:
     """Renders the worlds through another camera, for videos."""
-    return renderer(self._kinematics(state))
+    return renderer(self.poses(state))
+
+  def poses(self, state: PhysicsState) -> Kinematics:
+    """Returns the poses of geoms, sites and cameras in the world."""
+    return self._kinematics(state)
 
   def _repeated(self, x: Array) -> Array:
     """Repeats L times, [worlds, ...] -> [worlds, L, ...]."""
@@ -240,10 +244,20 @@ class Env:
     return observation.replace(global_image=overview, wrist_image=wrist)
 
 
-def make_env(config: EnvConfig, mesh: Mesh | None = None, *, instants: int = 0) -> Env:
+def make_env(
+  config: EnvConfig,
+  mesh: Mesh | None = None,
+  *,
+  instants: int = 0,
+  bank_seed: int = reset_bank.SEED,
+) -> Env:
   """Builds the worlds of ``config.task``, and its reset bank on first use.
 
-  ``instants`` is ``agent.lstm_instants`` of the agent that acts in it.
+  Args:
+    config: Settings of the environment.
+    mesh: Devices that share the worlds; the default device if None.
+    instants: ``agent.lstm_instants`` of the agent that acts in it.
+    bank_seed: Seed of the reset states; training uses the default.
 
   Raises:
     ConfigError: A setting is invalid, JAX has no device, the scene cannot be simulated
@@ -256,7 +270,7 @@ def make_env(config: EnvConfig, mesh: Mesh | None = None, *, instants: int = 0) 
   _substeps(config, task.scene)
   if config.obs == "pixels":
     make_cameras(config, task.scene)
-  bank, _ = load_bank(task, config.bank_rows)
+  bank, _ = reset_bank.load_bank(task, config.bank_rows, seed=bank_seed)
   return Env(config, task, bank, mesh, instants=instants)
 
 

@@ -40,7 +40,7 @@ from apnpql_jax.tasks.task import Task
 from apnpql_jax.types import Array
 
 VERSION = 3  # part of the cache key; increased when the meaning of a bank changes
-SEED = 0
+SEED = 0  # of the banks that training and its evaluations use
 CHUNK = 32
 MAX_DRAWS = 20  # per row before the task is rejected for lack of usable resets
 SETTLE_PERIODS = 4  # control periods of 0.15 s at rest before a draw is accepted
@@ -84,22 +84,25 @@ class BankReport:
     )
 
 
-def load_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
+def load_bank(
+  task: Task, rows: int, *, seed: int = SEED
+) -> tuple[ResetBank, BankReport]:
   """Loads the task's bank from the user's cache; builds it if there is no valid one.
 
-  Prints one line if the cached one cannot be used, or the new one cannot be kept.
+  ``seed`` draws its states. Prints one line if the cached one cannot be used, or the
+  new one cannot be kept.
   """
   cache = cache_dir()
   if cache is None:
-    return build_bank(task, rows)
-  path = cache / "banks" / _file_name(task, rows)
+    return build_bank(task, rows, seed=seed)
+  path = cache / "banks" / _file_name(task, rows, seed)
   try:
     return _read(path, task, rows)
   except FileNotFoundError:
     pass
   except Exception as error:  # Whatever a damaged or foreign file causes.
     print_line(f"{path} cannot be used and is built again: {one_line(error)}")
-  bank, report = build_bank(task, rows)
+  bank, report = build_bank(task, rows, seed=seed)
   arrays: dict[str, Any] = jax.tree.map(np.asarray, vars(bank))
   with reporting("keep the reset bank"):
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -128,7 +131,9 @@ def _read(path: pathlib.Path, task: Task, rows: int) -> tuple[ResetBank, BankRep
   return ResetBank(**jax.tree.map(jnp.asarray, arrays)), report
 
 
-def build_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
+def build_bank(
+  task: Task, rows: int, *, seed: int = SEED
+) -> tuple[ResetBank, BankReport]:
   """Draws, settles and solves ``rows`` reset states; shows progress on stderr.
 
   Raises:
@@ -136,7 +141,7 @@ def build_bank(task: Task, rows: int) -> tuple[ResetBank, BankReport]:
     UserError: A worker process died.
   """
   began = time.monotonic()
-  rng = np.random.default_rng(SEED)
+  rng = np.random.default_rng(seed)
   report = BankReport()
   kept: list[ResetBank] = []
   unfailing: Any = Unfailing(sys.stderr)
@@ -221,9 +226,9 @@ def _solve_targets(
   )
 
 
-def _file_name(task: Task, rows: int) -> str:
+def _file_name(task: Task, rows: int, seed: int) -> str:
   key = json.dumps(
-    [VERSION, SEED, rows, task.name, task.scene.fingerprint, _source(task)]
+    [VERSION, seed, rows, task.name, task.scene.fingerprint, _source(task)]
   )
   digest = hashlib.sha256(key.encode()).hexdigest()[:16]
   return f"{task.name}-{rows}-{digest}.npz"

@@ -35,6 +35,20 @@ def follow(
   return error * (speed / jnp.maximum(farthest, 1e-6))
 
 
+def destination(
+  velocity: Float[Array, "*b 6"], q: Float[Array, "*b 6"]
+) -> Float[Array, "*b 6"]:
+  """Returns the joint angles (rad) to which ``follow`` leads with these velocities.
+
+  The inverse of ``follow``. It stops at the distance from which the full speed is
+  reached, 0.7 rad, because a velocity does not tell how far beyond it the target is.
+  """
+  fastest = jnp.abs(velocity).max(-1, keepdims=True)
+  speed = jnp.minimum(fastest, MAX_VELOCITY)
+  farthest = jnp.maximum(speed / GAIN, speed**2 / (2 * BRAKING))
+  return q + velocity * (farthest / jnp.maximum(fastest, 1e-6))
+
+
 def refine(
   chain: arm.ArmChain,
   last: Float[Array, "*b 6"],

@@ -108,11 +108,10 @@ def make_recorder(env: Env, agent: Agent, config: AgentConfig) -> Recorder:
     predicted, label = heads.primitives(), state.timestep.primitives
     # The last component is a logit in the prediction and a command in the label.
     wrong = (predicted[..., ARM_DOF] > 0.0) != (label[..., ARM_DOF] > 0.5)
-    followed = _arm_error(label, env.expert_action(state)[:, None])
     return action, Instants(
       active=~state.timestep.last,
       solved=state.timestep.terminated,
-      stage=jnp.argmin(followed, axis=-1),
+      stage=expert_stage(env, state),
       error=_arm_error(predicted, label),
       gripper=wrong,
       kl=algorithm.policy_update(heads, prior, kl_key).kl,
@@ -134,6 +133,12 @@ def make_recorder(env: Env, agent: Agent, config: AgentConfig) -> Recorder:
     return jax.lax.scan(period, start, keys)[1]
 
   return record
+
+
+def expert_stage(env: Env, state: EnvState) -> Array:
+  """Returns the index of the primitive that the expert would follow, i32[worlds]."""
+  followed = env.expert_action(state)[:, None]
+  return jnp.argmin(_arm_error(state.timestep.primitives, followed), axis=-1)
 
 
 def _arm_error(a: Array, b: Array) -> Array:

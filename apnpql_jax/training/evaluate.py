@@ -20,8 +20,9 @@ from apnpql_jax.atomic import check_utf8, check_writable
 from apnpql_jax.config.checks import ACTING, check_env
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.console import print_line, reporting
-from apnpql_jax.envs.env import Env, make_env, observation_shapes
+from apnpql_jax.envs.env import HELD_OUT_SHARE, Env, make_env, observation_shapes
 from apnpql_jax.errors import ConfigError, check_name
+from apnpql_jax.primitives import reset_bank
 from apnpql_jax.runs import abandoned_tasks, checkpoint_reader, leaves, run_folder
 from apnpql_jax.runs.metrics import wilson_interval
 from apnpql_jax.training.rollout import (
@@ -94,6 +95,7 @@ def evaluate(
   backend: str | None = None,
   step: int | None = None,
   acting: str | None = None,
+  bank_seed: int = reset_bank.SEED,
   video: Path | str | None = None,
 ) -> dict[str, Any]:
   """Plays held-out episodes with a checkpoint of a run.
@@ -106,6 +108,8 @@ def evaluate(
     step: Step of the checkpoint; the newest if None.
     acting: Rule that chooses actions, see ``agents/acting.py``; that of the run's
       evaluations if None.
+    bank_seed: Seed of the reset states. Another than the default draws states on which
+      nothing was trained or chosen, as many as there are episodes.
     video: File for a video of the first episodes; failures to write are only printed.
 
   Returns:
@@ -118,12 +122,22 @@ def evaluate(
   began, video = time.monotonic(), _check(episodes, seed, video)
   if acting is not None:
     check_name("acting", acting, ACTING)
-  config, env, agent, params, step = load_trained(run_dir, backend=backend, step=step)
+  fresh = None if bank_seed == reset_bank.SEED else FreshBank(bank_seed, episodes)
+  config, env, agent, params, step = load_trained(
+    run_dir, backend=backend, step=step, fresh=fresh
+  )
   acting = acting or config.eval_acting
   play = make_player(env, lambda params: agent_policy(agent, params, acting=acting))
   played = play_held_out(env, play, params, episodes=episodes, seed=seed)
   about = {"algorithm": config.agent.algorithm, "acting": acting}
   return _summary(env, played, about, step, began, video)
+
+
+class FreshBank(NamedTuple):
+  """Reset states other than those of training."""
+
+  seed: int
+  held_out: int  # number of held-out rows
 
 
 class Trained(NamedTuple):
@@ -137,30 +151,52 @@ class Trained(NamedTuple):
 
 
 def load_trained(
-  run_dir: Path | str, *, backend: str | None, step: int | None
+  run_dir: Path | str,
+  *,
+  backend: str | None,
+  step: int | None,
+  fresh: FreshBank | None = None,
 ) -> Trained:
   """Restores the weights of a run, and builds its worlds and agent.
 
-  ``backend`` and ``step`` are as in ``evaluate``, and so are the errors.
+  ``backend`` and ``step`` are as in ``evaluate``, and so are the errors. ``fresh`` are
+  reset states in place of those of the run.
   """
   run_dir = Path(run_dir)
   config = run_folder.open_run(run_dir).config
   env_config = dataclasses.replace(config.env, backend=backend or config.env.backend)
   check_env(env_config)
   checkpoint_reader.restore(run_dir, step, {}, config=config)  # Fails early.
-  env = make_env(env_config, instants=config.agent.lstm_instants)
+  seed = reset_bank.SEED
+  if fresh is not None:
+    rows = math.ceil(fresh.held_out / HELD_OUT_SHARE)
+    seed, env_config = fresh.seed, dataclasses.replace(env_config, bank_rows=rows)
+  instants = config.agent.lstm_instants
+  env = make_env(env_config, instants=instants, bank_seed=seed)
   agent = make_agent(config.agent)
-  shapes = observation_shapes(config.env, env.task, instants=config.agent.lstm_instants)
+  shapes = observation_shapes(config.env, env.task, instants=instants)
   learner = jax.eval_shape(agent.init, jax.random.key(0), shapes)
-  example = {"target_params": learner.target_params}
-  devices.check_memory(leaves.nbytes(example), "the network")
+  devices.check_memory(leaves.nbytes(learner.target_params), "the network")
+  params, step = load_params(run_dir, config, learner.target_params, step)
+  return Trained(config, env, agent, params, step)
+
+
+def load_params(
+  run_dir: Path, config: TrainConfig, example: Params, step: int | None
+) -> tuple[Params, int]:
+  """Restores the weights that act from a checkpoint; returns them and the step.
+
+  ``example`` are weights of the run or their shapes, ``step`` is as in ``evaluate``.
+
+  Raises:
+    FileError: There is no such checkpoint, or it cannot be read.
+  """
   with abandoned_tasks.silenced():
-    wanted = {"learner": example}
+    wanted = {"learner": {"target_params": example}}
     found = checkpoint_reader.restore(run_dir, step, wanted, config=config, partly=True)
   for line in found.damaged:
     print_line(line)
-  params = found.items["learner"]["target_params"]
-  return Trained(config, env, agent, params, found.step)
+  return found.items["learner"]["target_params"], found.step
 
 
 def evaluate_expert(
@@ -195,8 +231,11 @@ def check_count(episodes: int, seed: int) -> None:
 def _check(episodes: int, seed: int, video: Path | str | None) -> Path | None:
   """Checks the arguments of an evaluation; returns the path of its video."""
   check_count(episodes, seed)
-  if video is None:
-    return None
+  return None if video is None else check_video(video)
+
+
+def check_video(video: Path | str) -> Path:
+  """Returns the path of a video; raises ``UserError`` if it cannot be written."""
   path = Path(video)
   if path.suffix not in (".mp4", ".gif"):
     raise ConfigError(f"video {path} must end in .mp4 or .gif")

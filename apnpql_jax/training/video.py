@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -114,12 +114,15 @@ def add_border(frames: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
   return out
 
 
-def write_video(path: Path, frames: np.ndarray, *, fps: float) -> Path:
+def write_video(
+  path: Path, frames: np.ndarray | Iterator[np.ndarray], *, fps: float
+) -> Path:
   """Writes frames as MP4, or as GIF if the path ends in ".gif".
 
   Args:
     path: File to write; any suffix other than ".gif" becomes ".mp4".
-    frames: u8[T, H, W, 3]; padded with black to what the codec needs.
+    frames: u8[T, H, W, 3], or an iterator over u8[H, W, 3], of which an MP4 holds one
+      at a time in memory; padded with black to what the codec needs.
     fps: Frames per second of playback.
 
   Returns:
@@ -129,25 +132,35 @@ def write_video(path: Path, frames: np.ndarray, *, fps: float) -> Path:
     ValueError: The frames are not u8[T, H, W, 3], or there are none.
     OSError: The file cannot be written.
   """
-  _check(frames)
+  if isinstance(frames, np.ndarray):
+    _check(frames)
   if path.suffix == ".gif":
+    every = frames if isinstance(frames, np.ndarray) else np.stack([*frames])
+    _check(every)
     with replacing(path) as part:
-      iio.imwrite(part, frames, duration=1000.0 / fps, loop=0)
+      iio.imwrite(part, every, duration=1000.0 / fps, loop=0)
     return path
   path = path.with_suffix(".mp4")
-  padding = [-side % _MACROBLOCK for side in frames.shape[1:3]]
-  frames = np.pad(frames, ((0, 0), (0, padding[0]), (0, padding[1]), (0, 0)))
-  height, width = frames.shape[1:3]
+  with replacing(path) as part:
+    _encode(part, frames, fps=fps)
+  return path
+
+
+def _encode(path: Path, frames: Iterable[np.ndarray], *, fps: float) -> None:
   # imageio's PyAV plugin cannot set the rate factor.
-  with replacing(path) as part, av.open(str(part), "w", format="mp4") as file:
+  with av.open(str(path), "w", format="mp4") as file:
     stream = file.add_stream("libx264", Fraction(fps).limit_denominator(1000))
-    stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+    stream.pix_fmt = "yuv420p"
     # Flat colors and hard edges need a rate factor below the default of 23.
     stream.options = {"crf": "10"}
-    for frame in frames:
+    for number, frame in enumerate(frames):
+      _check(frame[None])
+      padding = [(0, -side % _MACROBLOCK) for side in frame.shape[:2]]
+      frame = np.pad(frame, (*padding, (0, 0)))
+      if not number:
+        stream.height, stream.width = frame.shape[:2]
       file.mux(stream.encode(av.VideoFrame.from_ndarray(frame)))
     file.mux(stream.encode())
-  return path
 
 
 def _check(frames: np.ndarray) -> None:

@@ -30,6 +30,7 @@ DOC = store.ROOT / "docs" / "performance.md"
 BLOCKS = (
   *("fidelity", "render", "ray_layouts", "learner", "timeline", "encoder_layouts"),
   *("env_steps", "end_to_end", "compile_time", "growth", "memory", "peers"),
+  "stable_baselines",
 )
 PANELS = 3  # panels of a plot side by side
 

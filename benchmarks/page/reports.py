@@ -19,6 +19,7 @@ MODULES = {
   "fidelity": "quality.fidelity",
   "memory": "reliability.memory",
   "peers": "peers.compare",
+  "stable_baselines": "peers.stable_baselines",
 }
 """Modules of benchmarks outside ``benchmarks.speed``."""
 
@@ -54,6 +55,8 @@ COLUMNS = {
   "|checkpoint, s=checkpoint_s|iteration, s=iteration_s|longest, s=longest_s"
   "|all of it, MiB=whole_mib|s=whole_s",
   "peers": "peer|with|rate|ours / theirs (over rounds)=ratio",
+  "stable_baselines": "learner=row|minutes to 80 %=minutes_to_80|best|steps"
+  "|after, min=minutes",
 }
 """A column is HEAD=PATH:FORM; without a path the head is the key of the result."""
 
@@ -204,6 +207,16 @@ def peers(report: Report) -> Prepared:
   return rows, []
 
 
+def stable_baselines(report: Report) -> Prepared:
+  """Adds the best evaluation of each learner and the end of its curve."""
+  rows = []
+  for result in report["results"]:
+    curve = result["curve"]
+    best = percent(max(point["success_rate"] for point in curve))
+    rows.append(result | curve[-1] | {"best": best})
+  return rows, []
+
+
 def growth(report: Report) -> Prepared:
   """Makes a table for each axis, with the exponent of growth since the last size."""
   found = []
@@ -245,4 +258,5 @@ PREPARE: dict[str, Callable[[Report], Prepared]] = {
   "end_to_end": with_parts,
   "growth": growth,
   "peers": peers,
+  "stable_baselines": stable_baselines,
 }

@@ -162,7 +162,7 @@ def test_torch_learns_with_networks_of_the_same_size():
   config = load_preset("push_plate")
   agent, example = make_agent(config.agent), noise.transitions(config).observation_tm1
   params = jax.eval_shape(agent.init, jax.random.key(0), example).params
-  learner = torch_learner.Learner(config.agent, "cpu")
+  learner = torch_learner.Learner(config.agent, "cpu", compiled=False)
   count = sum(x.size for x in jax.tree.leaves(params))
   assert sum(x.numel() for x in learner.online.parameters()) == count
   batch = torch_learner.random_batch(4, "cpu")

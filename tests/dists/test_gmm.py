@@ -45,6 +45,24 @@ def test_log_prob_matches_scipy_for_every_batch_element():
     np.testing.assert_allclose(ours[(slice(None), *i)], expected, rtol=1e-4, atol=1e-4)
 
 
+def test_responsibilities_match_the_densities_of_the_components():
+  mixture = random_gmm(0, batch=(2, 3))
+  actions = mixture.sample(seed=jax.random.key(1), sample_shape=50)
+  found = jax.jit(GripperGMM.responsibilities)(mixture, actions)
+  assert found.shape == (50, 2, 3, 3)
+  for i in np.ndindex(2, 3):
+    one = jax.tree.map(lambda x, i=i: x[i], mixture)
+    points = np.asarray(actions[(slice(None), *i)])
+    log_weights = special.log_softmax(np.asarray(one.logits, np.float64))
+    joint = [
+      log_weights[k]
+      + scipy_log_prob(jax.tree.map(lambda x, k=k: x[k : k + 1], one), points)
+      for k in range(3)
+    ]
+    expected = special.softmax(joint, axis=0).T
+    np.testing.assert_allclose(found[(slice(None), *i)], expected, atol=1e-4)
+
+
 def assert_gradient(
   grads: GripperGMM, mixture: GripperGMM, function: Callable[[GripperGMM], float]
 ) -> None:

@@ -169,3 +169,26 @@ def test_registering_the_tasks_imports_neither_jax_nor_mujoco():
     "assert not {'jax', 'mujoco'} & set(sys.modules)"
   )
   subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_stable_baselines_sees_the_ends_of_episodes():
+  vec_env = pytest.importorskip("stable_baselines3.common.vec_env")
+  from apnpql_jax.gym.stable_baselines import StableBaselinesVecEnv
+
+  worlds = vec_env.VecMonitor(StableBaselinesVecEnv("push_plate", 2, **SHORT))
+  worlds.seed(0)
+  first = worlds.reset()
+  still = np.zeros((2, 7), np.float32)
+  steps = [worlds.step(still) for _ in range(4)]
+  assert [done.tolist() for _, _, done, _ in steps] == [[False] * 2] * 2 + [
+    [True] * 2,
+    [False] * 2,
+  ]
+  observation, _, _, infos = steps[2]
+  for world, info in enumerate(infos):
+    assert info["TimeLimit.truncated"] and not info["is_success"]
+    assert info["episode"]["l"] == 3
+    # The arm stood still; the observation is already that of the next episode.
+    joints = info["terminal_observation"]["robot"][-7:]
+    np.testing.assert_allclose(joints, first["robot"][world, -7:], atol=1e-3)
+    assert abs(joints - observation["robot"][world, -7:]).max() > 1e-3

@@ -194,6 +194,18 @@ def test_following_scales_all_joints_by_one_factor():
   np.testing.assert_allclose(near, tracking.GAIN * 0.01, rtol=1e-6)
 
 
+def test_a_destination_is_where_following_leads():
+  rng = np.random.default_rng(0)
+  q = jnp.asarray(rng.normal(size=(40, 6)), jnp.float32)
+  way = rng.uniform(-1.0, 1.0, (40, 6)) * np.geomspace(0.001, 0.7, 40)[:, None]
+  target = q + jnp.asarray(way, jnp.float32)
+  found = tracking.destination(tracking.follow(target, q), q)
+  np.testing.assert_allclose(found, target, atol=1e-5)
+  far = tracking.destination(tracking.follow(q + 3.0, q), q)
+  np.testing.assert_allclose(far - q, 1 / (2 * tracking.BRAKING), rtol=1e-4)
+  np.testing.assert_array_equal(tracking.destination(0 * q, q), q)
+
+
 @pytest.mark.parametrize("name", SLOW_MJX)
 def test_following_reaches_a_target_without_overshoot(engines, resets, task, name):
   """Start, at rest, and target are random configurations near the workspace."""
