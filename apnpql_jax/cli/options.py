@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import contextlib
 import dataclasses
 import io
+import os
 from pathlib import Path
 import re
 from typing import Annotated, ClassVar, TypeVar
@@ -272,6 +273,8 @@ def parse(kind: type[T], name: str, argv: Sequence[str], default: T | None = Non
     SystemExit: ``--help`` was given, and the help printed.
   """
   errors = io.StringIO()
+  if os.environ.get("NO_COLOR"):
+    tyro._experimental_options["ansi_codes"] = False
   try:
     with contextlib.redirect_stderr(errors):
       return tyro.cli(
@@ -281,6 +284,9 @@ def parse(kind: type[T], name: str, argv: Sequence[str], default: T | None = Non
         default=kind() if default is None else default,
         config=(tyro.conf.DisallowNone,),
       )
+  except BrokenPipeError:  # The reader of the help has enough, as `head`.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    raise SystemExit(0) from None
   except SystemExit as stop:
     if stop.code in (0, None):  # --help was printed.
       raise

@@ -23,8 +23,8 @@ class TrainProgress:
 
   Use as a context manager. Speeds count from the first update on, so that the first
   compilation does not lower them, and leave evaluations out. The time left is that of
-  the steps, checkpoints included, plus one evaluation each at the shortest time that
-  one has taken: the first one also compiles. Before the first, it is that of the steps.
+  the steps, checkpoints included, plus the evaluations to come at their mean time
+  without the first one, which also compiles. Before the first, it is a lower bound.
   """
 
   def __init__(
@@ -118,9 +118,11 @@ class TrainProgress:
     seconds = self._steps.time_remaining
     if seconds is None:
       return _UNKNOWN
-    if self._evaluations:
-      seconds += min(self._evaluations) * self._evaluations_left()
-    return str(datetime.timedelta(seconds=round(seconds)))
+    left = self._evaluations_left()
+    if known := self._evaluations[1:] or self._evaluations:
+      seconds += left * sum(known) / len(known)
+    bound = ">" if left and not known else ""
+    return f"{bound}{datetime.timedelta(seconds=round(seconds))}"
 
   def _evaluations_left(self) -> int:
     """Returns the number of evaluations to come, the present one included."""
