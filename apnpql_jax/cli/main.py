@@ -158,9 +158,9 @@ def _rows(result: Json) -> Generator[tuple[str, Any], None, None]:
 def _text(value: Any) -> str:
   if isinstance(value, dict):
     value = [f"{_number(x)} {name.replace('_', ' ')}" for name, x in value.items()]
-  if isinstance(value, list):
+  if isinstance(value, list | tuple):
     return ", ".join(map(_number, value)) or "none"
-  return str(value)
+  return _number(value) if isinstance(value, float) else str(value)
 
 
 def _number(value: Any) -> str:

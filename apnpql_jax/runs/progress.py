@@ -14,6 +14,9 @@ from apnpql_jax.console import Unfailing
 _SPEED_PERIOD_S = 600.0
 """Speeds are averaged over this time, which has to span several slow iterations."""
 
+_OTHER_COLUMNS = len("  100%  >00:00:00 left")
+"""Columns of the display besides the bar and the figures."""
+
 _UNKNOWN = "-:--:--"
 """Time left before there is a speed."""
 
@@ -49,13 +52,15 @@ class TrainProgress:
     self._total, self._eval_every = total_steps, eval_every
     self._evaluations: list[float] = []  # seconds
     self._evaluating = False
-    text = "{task.completed:,} steps  {task.fields[figures]}"
+    shown = console.Console(file=unfailing)
+    self._bar_width = 20 if shown.width >= 96 else 5 if shown.width >= 60 else 0
+    bars = [progress.BarColumn(self._bar_width)] if self._bar_width else []
     self._bar = progress.Progress(
-      progress.BarColumn(bar_width=24),
+      *bars,
       progress.TaskProgressColumn(),
-      progress.TextColumn(text, markup=False),
+      progress.TextColumn("{task.fields[figures]}", markup=False),
       progress.TextColumn("{task.fields[left]} left", style="progress.remaining"),
-      console=console.Console(file=unfailing),
+      console=shown,
       speed_estimate_period=_SPEED_PERIOD_S,
       get_time=lambda: clock() - sum(self._evaluations),
       disable=not unfailing.isatty(),
@@ -111,7 +116,13 @@ class TrainProgress:
 
   def _show(self) -> None:
     """Updates what the bar shows next to the steps."""
-    self._bar.update(self._steps.id, figures=self._figures(), left=self._left())
+    room = self._bar.console.width - self._bar_width - _OTHER_COLUMNS
+    shown: list[str] = []
+    for figure in (*self._figures(), f"{self._steps.completed:,} steps"):
+      if len("  ".join([*shown, figure])) <= room:
+        shown.append(figure)
+    text = "  ".join(shown)
+    self._bar.update(self._steps.id, figures=text, left=self._left())
 
   def _left(self) -> str:
     """Returns the time left as hours, minutes and seconds."""
@@ -132,19 +143,18 @@ class TrainProgress:
     at_end = step < self._total and self._total % every > 0
     return max(self._total // every - step // every, 0) + at_end + self._evaluating
 
-  def _figures(self) -> str:
+  def _figures(self) -> list[str]:
+    """Returns success and speeds, the most important first."""
     success = "--" if self._success is None else f"{100 * self._success:.0f} %"
     figures = [f"success {success}"]
     if steps_per_s := self._steps.speed:
       figures.append(f"{steps_per_s:,.0f} steps/s")
     if updates_per_s := self._updates.speed:
       figures.append(f"{updates_per_s:,.1f} updates/s")
-    return "  ".join(figures)
+    return figures
 
   def _print_line(self) -> None:
     steps = self._steps
-    self.message(
-      f"step {steps.completed:,} of {steps.total:,} ({steps.percentage:.0f} %)  "
-      f"{steps.fields['figures']}  {steps.fields['left']} left"
-    )
+    done = f"step {steps.completed:,} of {steps.total:,} ({steps.percentage:.0f} %)"
+    self.message("  ".join([done, *self._figures(), f"{self._left()} left"]))
     self._printed_at, self._unprinted = self._clock(), False
