@@ -21,6 +21,7 @@ CONFIG = dataclasses.replace(
     global_size=(120, 160),
     wrist_size=(60, 107),
   ),
+  agent=dataclasses.replace(_PLACE.agent, decay_updates=51_200),
   # Images of this size take 77 kB per slot.
   replay=dataclasses.replace(_PLACE.replay, capacity=25_600, expert_steps=12_800),
   total_steps=409_600,

@@ -49,10 +49,11 @@ _NOT_NEGATIVE = (
   "agent.lambda_ap agent.m_step_delay agent.decay_updates agent.residual_blocks "
   "replay.expert_steps replay.expert_noise seed save_replay_every"
 ).split()
+MIN_BANK_ROWS = 16
 _BOUNDS = {
   # A quarter of the bank is held out for evaluation. Bank and atoms are computed on the
   # host before memory is checked.
-  "env.bank_rows": (16, 1 << 20),
+  "env.bank_rows": (MIN_BANK_ROWS, 1 << 20),
   "agent.num_atoms": (2, 10_000),
   "agent.target_samples": (2, math.inf),
   "agent.policy_samples": (2, math.inf),

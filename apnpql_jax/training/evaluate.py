@@ -17,7 +17,7 @@ from apnpql_jax import devices
 from apnpql_jax.agents.learner import Agent, make_agent
 from apnpql_jax.agents.networks import Params
 from apnpql_jax.atomic import check_utf8, check_writable
-from apnpql_jax.config.checks import ACTING, check_env
+from apnpql_jax.config.checks import ACTING, MIN_BANK_ROWS, check_env
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.console import print_line, reporting
 from apnpql_jax.envs.env import HELD_OUT_SHARE, Env, make_env, observation_shapes
@@ -122,6 +122,8 @@ def evaluate(
   began, video = time.monotonic(), _check(episodes, seed, video)
   if acting is not None:
     check_name("acting", acting, ACTING)
+  if not 0 <= bank_seed < 2**31:
+    raise ConfigError(f"bank_seed={bank_seed} must be within 0 and 2**31 - 1")
   fresh = None if bank_seed == reset_bank.SEED else FreshBank(bank_seed, episodes)
   config, env, agent, params, step = load_trained(
     run_dir, backend=backend, step=step, fresh=fresh
@@ -169,7 +171,7 @@ def load_trained(
   checkpoint_reader.restore(run_dir, step, {}, config=config)  # Fails early.
   seed = reset_bank.SEED
   if fresh is not None:
-    rows = math.ceil(fresh.held_out / HELD_OUT_SHARE)
+    rows = max(MIN_BANK_ROWS, math.ceil(fresh.held_out / HELD_OUT_SHARE))
     seed, env_config = fresh.seed, dataclasses.replace(env_config, bank_rows=rows)
   instants = config.agent.lstm_instants
   env = make_env(env_config, instants=instants, bank_seed=seed)

@@ -113,7 +113,7 @@ def options_of(task: str, row: str, seed: int) -> list[str]:
   options = (
     f"--env.obs state --agent.algorithm {algorithm} --seed {seed} --no-video "
     "--env.worlds 32 --env.bank-rows 2048 "
-    "--eval-acting policy --agent.candidate-precision float32 "
+    "--eval-acting policy --agent.candidate-precision float32 --agent.decay-updates 0 "
     "--replay.allow-unsolved "  # As when the stored results were made; no effect here.
     f"--replay.expert-steps {EXPERT_STEPS.get(task, 25_600)} "
     f"--total-steps {budget * STEPS} --eval-every {budget * STEPS // EVALUATIONS} "

@@ -26,6 +26,7 @@ from apnpql_jax.errors import ConfigError
 POSITIVE = st.floats(1e-6, 1e6, allow_nan=False)
 
 ADDED = {
+  "env.task_file": "",
   "env.global_size": (72, 96),
   "env.wrist_size": (36, 64),
   "env.shadows": False,

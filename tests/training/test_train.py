@@ -153,9 +153,18 @@ def test_evaluate_reports_the_newest_checkpoint(finished, tmp_path):
   assert 0 <= low <= figures["success_rate"] <= high <= 1
 
 
+def test_evaluate_plays_from_states_of_another_bank(finished):
+  run_dir, _ = finished
+  played = [evaluate(run_dir, episodes=3, bank_seed=seed) for seed in (1, 1, 2)]
+  assert all(figures["episodes"] == 3 for figures in played)
+  lengths = [figures["mean_length"] for figures in played]
+  assert lengths[0] == lengths[1]
+
+
 @pytest.mark.parametrize(
   ("argument", "words"),
   [
+    ({"bank_seed": -1}, "bank_seed=-1 must be within"),
     ({"episodes": 0}, "episodes=0 must be at least 1"),
     ({"seed": -1}, "seed=-1 must be within"),
     ({"backend": "bullet"}, "'bullet'; choose from auto"),
@@ -172,7 +181,7 @@ def test_evaluate_rejects_arguments_before_it_looks_for_checkpoints(
 
 def test_evaluate_has_the_defaults_of_the_command_line():
   defaults = inspect.signature(evaluate).parameters
-  for name in ("episodes", "seed", "backend", "acting", "video"):
+  for name in ("episodes", "seed", "backend", "acting", "bank_seed", "video"):
     assert defaults[name].default == getattr(Evaluate(), name)
 
 
