@@ -120,3 +120,17 @@ def test_bash_completes_commands_and_options(words, expected, tmp_path, capsys):
 def test_a_shell_without_a_script_is_named(capsys):
   assert main.main(["completion", "fish"]) == 2
   assert "choose from bash, zsh, tcsh" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("args", ["train push_plate --help", "sweep --help"])
+def test_the_help_of_a_command_imports_nothing_slow(args):
+  code = (
+    "import sys; from apnpql_jax.cli.main import main\n"
+    f"try: main({args.split()})\n"
+    "except SystemExit: pass\n"
+    "print({'jax', 'mujoco', 'numpy', 'matplotlib', 'rich'} & set(sys.modules))"
+  )
+  done = subprocess.run(
+    [sys.executable, "-c", code], env=ENV, capture_output=True, text=True
+  )
+  assert done.stdout.splitlines()[-1] == "set()", done.stderr
