@@ -12,8 +12,6 @@ from collections.abc import Callable
 import contextlib
 import ctypes
 import itertools
-import os
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -21,11 +19,10 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, PartitionSpec
 import numpy as np
 
+from apnpql_jax import runtime
 from apnpql_jax.errors import ConfigError, one_line
 
 AXIS = "worlds"  # the only axis of the mesh; batches are split along it too
-_MEMINFO = Path("/proc/meminfo")
-_CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 _BARRIER_TIMEOUT_MS = 3_600_000
 _barriers = itertools.count()
 
@@ -137,14 +134,8 @@ def available_memory() -> int | None:
   stats = jax.local_devices()[0].memory_stats() or {}
   if "bytes_limit" in stats:
     return stats["bytes_limit"] - stats.get("bytes_in_use", 0)
-  host = host_memory()
+  host = runtime.host_memory()
   return None if host is None else host // jax.local_device_count()
-
-
-def host_memory() -> int | None:
-  """Returns the bytes of RAM that this process may still use; None if unknown."""
-  bounds = [b for b in (_free_memory(), _container_limit()) if b is not None]
-  return min(bounds, default=None)
 
 
 def release_memory() -> None:
@@ -154,19 +145,3 @@ def release_memory() -> None:
   """
   with contextlib.suppress(AttributeError, OSError):
     ctypes.CDLL(None).malloc_trim(0)
-
-
-def _free_memory() -> int | None:
-  with contextlib.suppress(OSError, KeyError, ValueError):
-    lines = dict(x.split(":", 1) for x in _MEMINFO.read_text().splitlines())
-    return int(lines["MemAvailable"].split()[0]) * 1024
-  with contextlib.suppress(AttributeError, OSError, ValueError):
-    # Outside Linux: total memory, free or not.
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-  return None
-
-
-def _container_limit() -> int | None:
-  with contextlib.suppress(OSError, ValueError):  # No limit, or "max".
-    return int(_CGROUP_LIMIT.read_text())
-  return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+UNWELL = 1  # exit code of a check that found something that must be changed
 INTERRUPTED = 128  # plus the signal number: exit code of a run stopped by a signal
 FAILED = 3  # exit code of a run stopped by an error: disk full or non-finite updates
 

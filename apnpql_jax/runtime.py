@@ -35,6 +35,8 @@ MIN_THREADS = 4  # XLA:CPU threads per emulated device, which share a pool
 KEPT_FUSIONS = "INDIVIDUAL_CONVOLUTION", "INDIVIDUAL_DOT"
 # The flag and the jaxlib versions that have it; XLA aborts on unknown flags.
 _JAX_DEFAULTS = None, 1.0  # of the settings below
+_MEMINFO = Path("/proc/meminfo")
+_CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 _FLAG, _FLAG_VERSIONS = "xla_cpu_experimental_ynn_fusion_type", r"0\.1[01]\."
 
 
@@ -185,3 +187,25 @@ def cores() -> int:
   if hasattr(os, "sched_getaffinity"):  # Not on macOS.
     return len(os.sched_getaffinity(0))
   return os.cpu_count() or 1
+
+
+def host_memory() -> int | None:
+  """Returns the bytes of RAM that this process may still use; None if unknown."""
+  bounds = [b for b in (_free_memory(), _container_limit()) if b is not None]
+  return min(bounds, default=None)
+
+
+def _free_memory() -> int | None:
+  with contextlib.suppress(OSError, KeyError, ValueError):
+    lines = dict(x.split(":", 1) for x in _MEMINFO.read_text().splitlines())
+    return int(lines["MemAvailable"].split()[0]) * 1024
+  with contextlib.suppress(AttributeError, OSError, ValueError):
+    # Outside Linux: total memory, free or not.
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+  return None
+
+
+def _container_limit() -> int | None:
+  with contextlib.suppress(OSError, ValueError):  # No limit, or "max".
+    return int(_CGROUP_LIMIT.read_text())
+  return None

@@ -12,9 +12,11 @@ import sys
 from typing import Any
 
 from apnpql_jax import __version__, errors, runtime
-from apnpql_jax.cli import commands, options, watch
+from apnpql_jax.cli import commands, options, text, watch
 from apnpql_jax.cli.commands import Json
 from apnpql_jax.cli.compare import Compare, compare
+from apnpql_jax.cli.completion import Completion, completion
+from apnpql_jax.cli.doctor import Doctor, doctor
 from apnpql_jax.cli.new_task import NewTask, new_task
 from apnpql_jax.cli.options import Train, parse
 from apnpql_jax.cli.plot import Plot, plot
@@ -28,8 +30,9 @@ from apnpql_jax.runs.signals import Signals
 def main(argv: Sequence[str] | None = None) -> int:
   """Runs one command line and returns its exit code.
 
-  0 is success, 2 bad input, 3 a run that had to stop (disk full, non-finite updates),
-  130 Ctrl-C and 143 SIGTERM, with the run saved. All but 0 print one line to stderr.
+  0 is success, 1 a machine that `doctor` finds unfit, 2 bad input, 3 a run that had to
+  stop (disk full, non-finite updates), 130 Ctrl-C and 143 SIGTERM, with the run saved.
+  All but 0 and 1 print one line to stderr.
   """
   _fill_closed_streams()
   args = list(sys.argv[1:] if argv is None else argv)
@@ -53,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
       if result:  # Empty in all but the first of several processes.
         with reporting("print the result"):
           write(json.dumps(_plain(result)) if parsed.json else _show(result))
-    return 0
+    return result.get("exit_code", 0)
   except (UserError, OSError) as error:  # Errors of the file system name the path.
     print_line(f"apnpql: {' '.join(str(error).split())}")
     return 2
@@ -139,9 +142,7 @@ def _show(result: Json) -> str:
   """Returns the result as one line per entry, for people, or its ``text``."""
   if "text" in result:
     return result["text"].rstrip()
-  rows = dict(_rows(result))
-  width = max(map(len, rows))
-  return "\n".join(f"{name:<{width}}  {_text(x)}" for name, x in rows.items())
+  return "\n".join(text.rows((name, _text(x)) for name, x in _rows(result)))
 
 
 def _rows(result: Json) -> Generator[tuple[str, Any], None, None]:
@@ -157,9 +158,9 @@ def _rows(result: Json) -> Generator[tuple[str, Any], None, None]:
 def _text(value: Any) -> str:
   if isinstance(value, dict):
     value = [f"{_number(x)} {name.replace('_', ' ')}" for name, x in value.items()]
-  if isinstance(value, list):
+  if isinstance(value, list | tuple):
     return ", ".join(map(_number, value)) or "none"
-  return str(value)
+  return _number(value) if isinstance(value, float) else str(value)
 
 
 def _number(value: Any) -> str:
@@ -169,11 +170,18 @@ def _number(value: Any) -> str:
 
 
 def _help() -> str:
-  lines = ["usage: apnpql COMMAND [options]", ""]
-  for name, (kind, _) in _COMMANDS.items():
-    lines.append(f"  {name:<9} {(kind.__doc__ or '').splitlines()[0]}")
-  lines += ["", "apnpql COMMAND --help shows its options."]
-  return "\n".join(lines)
+  about = [(f"  {name}", _summary(kind)) for name, kind in _options().items()]
+  lines = ["usage: apnpql COMMAND [options]", "", *text.rows(about), ""]
+  return "\n".join([*lines, *text.wrapped("apnpql COMMAND --help shows its options.")])
+
+
+def _summary(kind: type[Any]) -> str:
+  """Returns the first line about a command, without its usage."""
+  return (kind.__doc__ or "").splitlines()[0].partition(": apnpql")[0].rstrip(".")
+
+
+def _options() -> dict[str, type[Any]]:
+  return {name: kind for name, (kind, _) in _COMMANDS.items()}
 
 
 _COMMANDS: dict[str, tuple[type[Any], Callable[[Any], Json]]] = {
@@ -189,4 +197,6 @@ _COMMANDS: dict[str, tuple[type[Any], Callable[[Any], Json]]] = {
   "compare": (Compare, compare),
   "new-task": (NewTask, new_task),
   "list": (options.List, commands.list_names),
+  "doctor": (Doctor, doctor),
+  "completion": (Completion, lambda args: completion(args, _options())),
 }

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import tyro
 
 from apnpql_jax.atomic import check_writable
+from apnpql_jax.cli.options import Command
 from apnpql_jax.config import files
 from apnpql_jax.errors import ConfigError
 
@@ -17,20 +18,23 @@ _EXAMPLE = "touch_ball"
 
 
 @dataclasses.dataclass(frozen=True)
-class NewTask:
+class NewTask(Command):
   """Writes the files of a new task: apnpql new-task NAME.
 
   NAME.py and NAME.xml are a complete task to change: touching a ball.
+
+  apnpql new-task my_task
+
+  apnpql new-task my_task --folder tasks
   """
+
+  uses_jax: ClassVar[bool] = False
 
   name: tyro.conf.Positional[str] = ""
   """Name of the task: lower-case letters, digits and underscores."""
 
   folder: Path = Path(".")
   """Folder to write to."""
-
-  json: tyro.conf.FlagCreatePairsOff[bool] = False
-  """Print only one JSON object on standard output."""
 
 
 def new_task(args: NewTask) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import contextlib
 import dataclasses
 import io
+import os
 from pathlib import Path
 import re
 from typing import Annotated, ClassVar, TypeVar
@@ -68,6 +69,10 @@ class Train(OfRun):
   """Trains an agent: apnpql train PRESET [options].
 
   Every setting of the preset can be overridden, e.g. --agent.epsilon 0.5.
+
+  apnpql train push_plate --seed 1 --run runs/mine
+
+  apnpql train --resume runs/mine
   """
 
   preset: tyro.conf.Positional[str] = ""
@@ -119,7 +124,12 @@ class Train(OfRun):
 
 @dataclasses.dataclass(frozen=True)
 class Evaluate(_Play, OfRun):
-  """Plays held-out episodes with a trained agent: apnpql evaluate RUN [options]."""
+  """Plays held-out episodes with a trained agent: apnpql evaluate RUN [options].
+
+  apnpql evaluate runs/mine --episodes 200 --seed 7
+
+  apnpql evaluate runs/mine --checkpoint best --video best.mp4
+  """
 
   run: tyro.conf.Positional[str] = ""
   """Run folder."""
@@ -141,7 +151,12 @@ class Evaluate(_Play, OfRun):
 
 @dataclasses.dataclass(frozen=True)
 class Diagnose(OfRun):
-  """Reports where and why an agent fails: apnpql diagnose RUN [options]."""
+  """Reports where and why an agent fails: apnpql diagnose RUN [options].
+
+  apnpql diagnose runs/mine
+
+  apnpql diagnose runs/mine --checkpoint best --episodes 128
+  """
 
   run: tyro.conf.Positional[str] = ""
   """Run folder."""
@@ -161,7 +176,12 @@ class Diagnose(OfRun):
 
 @dataclasses.dataclass(frozen=True)
 class Collect(_Play):
-  """Plays episodes with the scripted expert: apnpql collect TASK [options]."""
+  """Plays episodes with the scripted expert: apnpql collect TASK [options].
+
+  apnpql collect push_plate --video expert.mp4
+
+  apnpql collect push_plate --episodes 200 --noise 0.03 --save mine.npz
+  """
 
   task: tyro.conf.Positional[str] = ""
   """Task to play, or the path of its file; `apnpql list` shows all."""
@@ -185,7 +205,12 @@ class Collect(_Play):
 
 @dataclasses.dataclass(frozen=True)
 class Convert(Command):
-  """Converts a recording to demonstrations: apnpql convert REC.npz TASK OUT.npz."""
+  """Converts a recording to demonstrations: apnpql convert REC.npz TASK OUT.npz.
+
+  apnpql convert recording.npz push_plate mine.npz
+
+  apnpql convert other.npz push_plate mine.npz --append --solved-only
+  """
 
   recording: tyro.conf.Positional[str] = ""
   """Joint trajectories and object poses (docs/demonstrations.md), or another
@@ -212,7 +237,12 @@ class Convert(Command):
 
 @dataclasses.dataclass(frozen=True)
 class Repeat(OfRun):
-  """Repeats an update with NaN or infinity: apnpql repeat RUN/faults/step_<n>.npz."""
+  """Repeats an update with NaN or infinity: apnpql repeat RUN/faults/step_<n>.npz.
+
+  apnpql repeat runs/mine/faults/step_00001024.npz
+
+  apnpql repeat runs/mine/faults/step_00001024.npz --task-file my_task.py
+  """
 
   file: tyro.conf.Positional[str] = ""
   """File that a run wrote when it stopped, still in its run folder."""
@@ -220,7 +250,12 @@ class Repeat(OfRun):
 
 @dataclasses.dataclass(frozen=True)
 class List(Command):
-  """Lists the tasks, presets, algorithms and backends: apnpql list [FILE...]."""
+  """Lists the tasks, presets, algorithms and backends: apnpql list [FILE...].
+
+  apnpql list --json
+
+  apnpql list my_task.py --contacts
+  """
 
   files: tyro.conf.Positional[tuple[Path, ...]] = ()
   """Python files whose tasks to list as well."""
@@ -238,6 +273,8 @@ def parse(kind: type[T], name: str, argv: Sequence[str], default: T | None = Non
     SystemExit: ``--help`` was given, and the help printed.
   """
   errors = io.StringIO()
+  if os.environ.get("NO_COLOR"):
+    tyro._experimental_options["ansi_codes"] = False
   try:
     with contextlib.redirect_stderr(errors):
       return tyro.cli(
@@ -247,6 +284,9 @@ def parse(kind: type[T], name: str, argv: Sequence[str], default: T | None = Non
         default=kind() if default is None else default,
         config=(tyro.conf.DisallowNone,),
       )
+  except BrokenPipeError:  # The reader of the help has enough, as `head`.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    raise SystemExit(0) from None
   except SystemExit as stop:
     if stop.code in (0, None):  # --help was printed.
       raise

@@ -28,7 +28,12 @@ LOOPBACK = ("127.0.0.1", "localhost")
 
 @dataclasses.dataclass(frozen=True)
 class Watch(OfRun):
-  """Shows episodes and what leads to each action: apnpql watch RUN|expert|random."""
+  """Shows episodes and what leads to each action: apnpql watch RUN|expert|random.
+
+  apnpql watch runs/mine
+
+  apnpql watch expert --task stack_box --video expert.mp4
+  """
 
   what: tyro.conf.Positional[str] = ""
   """Run folder, which may still be training; or expert or random, with --task."""

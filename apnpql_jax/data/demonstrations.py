@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from apnpql_jax import devices
+from apnpql_jax import runtime
 from apnpql_jax.atomic import replacing
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.data import npz
@@ -154,7 +154,7 @@ def load(
     FileError: The file has another format, version, task or control period, or an
       invalid state, or no episode is solved and ``allow_unsolved`` is False.
   """
-  arrays = npz.read(path, limit=devices.host_memory() or 1 << 32)
+  arrays = npz.read(path, limit=runtime.host_memory() or 1 << 32)
   fields = Demonstrations._fields
   wanted = {"format", "version", "task", "control_period_s", *fields}
   expected = {"format": FORMAT, "version": VERSION, "task": task.name}

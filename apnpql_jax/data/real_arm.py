@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from apnpql_jax import devices
+from apnpql_jax import runtime
 from apnpql_jax.data import demonstrations, npz
 from apnpql_jax.data.demonstrations import Demonstrations
 from apnpql_jax.errors import FileError, UserError
@@ -44,7 +44,7 @@ def convert(path: Path, scene: Scene, *, period_s: float) -> Demonstrations:
     FileError: Poses or conventions are missing, a shape is wrong, a value is out of
       range, or the arm moves too fast.
   """
-  arrays = npz.read(path, limit=devices.host_memory() or 1 << 32)
+  arrays = npz.read(path, limit=runtime.host_memory() or 1 << 32)
   try:
     recorded = _read(arrays, scene)
     variant, episode = recorded.pop("variant"), recorded.pop("episode")

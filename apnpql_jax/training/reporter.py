@@ -59,6 +59,13 @@ class Reporter:
 
   def evaluate(self, step: int, state: TrainState, *, last: bool) -> float:
     """Plays held-out episodes; writes metrics, the curve and, at the end, a video."""
+    with self._progress.evaluation():
+      rate = self._evaluate(step, state, last)
+    self._progress.update(step, updates=int(state.learner.step), success_rate=rate)
+    self._lap = time.monotonic()
+    return rate
+
+  def _evaluate(self, step: int, state: TrainState, last: bool) -> float:
     began = time.monotonic()
     config, run_dir = self._config, self._run_dir
     params = devices.local(state.learner.target_params)
@@ -80,6 +87,4 @@ class Reporter:
       f"step {step:,}: {figures['successes']} of {figures['episodes']} held-out "
       f"episodes solved ({100 * rate:.0f} %)"
     )
-    self._progress.update(step, updates=int(state.learner.step), success_rate=rate)
-    self._lap = time.monotonic()
     return rate

@@ -345,7 +345,7 @@ def test_progress_draws_a_bar_on_a_terminal():
       shown += part
   os.close(controller)
   shown = shown.decode()
-  assert "50%" in shown and "500 steps  success 50 %  40 steps/s" in shown
+  assert "50%" in shown and "success 50 %  40 steps/s  8.0 updates/s" in shown
   assert "0:00:13" in shown  # Left: 500 steps at 40 a second.
   assert "a [bracketed] note" in shown and "\x1b[" in shown
 
