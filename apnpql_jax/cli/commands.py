@@ -82,7 +82,7 @@ def train(args: Train) -> Json:
 
 def evaluate(args: Evaluate) -> Json:
   """Plays held-out episodes with a checkpoint of a run."""
-  run_dir = _existing_run(args.run, "evaluate", args.task_file)
+  run_dir = existing_run(args.run, "evaluate", args.task_file)
   _check_free(args.video, overwrite=args.overwrite)
 
   from apnpql_jax.training.evaluate import evaluate as evaluate_run
@@ -92,7 +92,7 @@ def evaluate(args: Evaluate) -> Json:
     episodes=args.episodes,
     seed=args.seed,
     backend=args.backend,
-    step=_checkpoint_step(args),
+    step=checkpoint_step(args.run, args.checkpoint),
     acting=args.acting,
     video=args.video,
   )
@@ -100,7 +100,7 @@ def evaluate(args: Evaluate) -> Json:
 
 def diagnose(args: Diagnose) -> Json:
   """Reports what limits the success of a trained agent."""
-  run_dir = _existing_run(args.run, "diagnose", args.task_file)
+  run_dir = existing_run(args.run, "diagnose", args.task_file)
 
   from apnpql_jax.training.diagnose import diagnose as diagnose_run
 
@@ -109,7 +109,7 @@ def diagnose(args: Diagnose) -> Json:
     episodes=args.episodes,
     seed=args.seed,
     backend=args.backend,
-    step=_checkpoint_step(args),
+    step=checkpoint_step(args.run, args.checkpoint),
   )
 
 
@@ -227,7 +227,7 @@ def _mesh(args: Train) -> Mesh | None:
   return devices.make_mesh(0)
 
 
-def _existing_run(run: str, command: str, task_file: Path | None) -> Path:
+def existing_run(run: str, command: str, task_file: Path | None) -> Path:
   """Returns the folder of a run; raises ``UserError`` if it is not one."""
   if not run:
     raise ConfigError(f"{command} needs a run folder: apnpql {command} RUN")
@@ -306,16 +306,16 @@ def _task_env(task: str) -> EnvConfig:
   return files.task_env(task)
 
 
-def _checkpoint_step(args: Evaluate | Diagnose) -> int | None:
+def checkpoint_step(run: Path | str, checkpoint: str) -> int | None:
   """Returns the step of the checkpoint asked for; None for the newest."""
-  if args.checkpoint == "newest":
+  if checkpoint == "newest":
     return None
-  if args.checkpoint == "best":
+  if checkpoint == "best":
     from apnpql_jax.runs.checkpoint_reader import best_step
 
-    return best_step(Path(args.run))
-  if args.checkpoint.isdecimal() and len(args.checkpoint) < 20:
-    return int(args.checkpoint)
+    return best_step(Path(run))
+  if checkpoint.isdecimal() and len(checkpoint) < 20:
+    return int(checkpoint)
   raise ConfigError(
-    f"unknown --checkpoint {args.checkpoint!r}; choose from newest, best, or a step"
+    f"unknown --checkpoint {checkpoint!r}; choose from newest, best, or a step"
   )

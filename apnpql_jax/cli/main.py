@@ -15,6 +15,7 @@ from apnpql_jax import __version__, errors, runtime
 from apnpql_jax.cli import commands, options
 from apnpql_jax.cli.commands import Json
 from apnpql_jax.cli.compare import Compare, compare
+from apnpql_jax.cli.export import Export, export
 from apnpql_jax.cli.new_task import NewTask, new_task
 from apnpql_jax.cli.options import Train, parse
 from apnpql_jax.cli.plot import Plot, plot
@@ -180,6 +181,7 @@ _COMMANDS: dict[str, tuple[type[Any], Callable[[Any], Json]]] = {
   "train": (Train, commands.train),
   "evaluate": (options.Evaluate, commands.evaluate),
   "diagnose": (options.Diagnose, commands.diagnose),
+  "export": (Export, export),
   "collect": (options.Collect, commands.collect),
   "convert": (options.Convert, commands.convert),
   "repeat": (options.Repeat, commands.repeat),

@@ -18,14 +18,15 @@ from apnpql_jax.errors import ConfigError
 T = TypeVar("T")
 
 
-def _default_hint(text: str) -> object:
+def default_hint(text: str) -> object:
+  """Returns the annotation of an option whose help describes its default."""
   return tyro.conf.arg(help_behavior_hint=text)
 
 
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
-_OfPreset = Annotated[str | None, _default_hint("(default: as in the preset)")]
-Count = Annotated[int | None, _default_hint("")]
-File = Annotated[Path | None, _default_hint("")]
+_OfPreset = Annotated[str | None, default_hint("(default: as in the preset)")]
+Count = Annotated[int | None, default_hint("")]
+File = Annotated[Path | None, default_hint("")]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +41,9 @@ class Command:
 
 
 @dataclasses.dataclass(frozen=True)
-class _OfRun(Command):
+class OfRun(Command):
+  """Options of commands on a run."""
+
   task_file: File = None
   """Python file of the run's task, if that is not installed."""
 
@@ -61,7 +64,7 @@ class _Play(Command):
 
 
 @dataclasses.dataclass(frozen=True)
-class Train(_OfRun):
+class Train(OfRun):
   """Trains an agent: apnpql train PRESET [options].
 
   Every setting of the preset can be overridden, e.g. --agent.epsilon 0.5.
@@ -71,15 +74,15 @@ class Train(_OfRun):
   """Preset to start from; `apnpql list` shows all. Or the path of a file with a preset
   and its task, such as ./my_task.py."""
 
-  run: Annotated[
-    Path | None, _default_hint("(default: first free runs/PRESET-<n>)")
-  ] = None
+  run: Annotated[Path | None, default_hint("(default: first free runs/PRESET-<n>)")] = (
+    None
+  )
   """Run folder to create."""
 
   resume: File = None
   """Run folder to resume from its latest checkpoint."""
 
-  init_from: Annotated[str | None, _default_hint("")] = None
+  init_from: Annotated[str | None, default_hint("")] = None
   """Run with whose weights the new one starts: RUN (its newest checkpoint), RUN:STEP or
   RUN:best."""
 
@@ -115,7 +118,7 @@ class Train(_OfRun):
 
 
 @dataclasses.dataclass(frozen=True)
-class Evaluate(_Play, _OfRun):
+class Evaluate(_Play, OfRun):
   """Plays held-out episodes with a trained agent: apnpql evaluate RUN [options]."""
 
   run: tyro.conf.Positional[str] = ""
@@ -124,16 +127,16 @@ class Evaluate(_Play, _OfRun):
   checkpoint: str = "newest"
   """Checkpoint: newest, best (highest success rate in training) or its step."""
 
-  acting: Annotated[str | None, _default_hint("(default: as in training)")] = None
+  acting: Annotated[str | None, default_hint("(default: as in training)")] = None
   """How to choose an action: policy draws from the policy, mean takes the mean of its
   likeliest component, prior draws from b without Q, greedy takes the highest Q."""
 
-  backend: Annotated[str | None, _default_hint("(default: as in training)")] = None
+  backend: Annotated[str | None, default_hint("(default: as in training)")] = None
   """Physics engine: auto, mjx or native."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Diagnose(_OfRun):
+class Diagnose(OfRun):
   """Reports where and why an agent fails: apnpql diagnose RUN [options]."""
 
   run: tyro.conf.Positional[str] = ""
@@ -148,7 +151,7 @@ class Diagnose(_OfRun):
   seed: int = 0
   """Random seed of the episodes and of the policy."""
 
-  backend: Annotated[str | None, _default_hint("(default: as in training)")] = None
+  backend: Annotated[str | None, default_hint("(default: as in training)")] = None
   """Physics engine: auto, mjx or native."""
 
 
@@ -204,7 +207,7 @@ class Convert(Command):
 
 
 @dataclasses.dataclass(frozen=True)
-class Repeat(_OfRun):
+class Repeat(OfRun):
   """Repeats an update with NaN or infinity: apnpql repeat RUN/faults/step_<n>.npz."""
 
   file: tyro.conf.Positional[str] = ""

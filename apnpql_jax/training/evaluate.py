@@ -24,6 +24,7 @@ from apnpql_jax.envs.env import Env, make_env, observation_shapes
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs import abandoned_tasks, checkpoint_reader, leaves, run_folder
 from apnpql_jax.runs.metrics import wilson_interval
+from apnpql_jax.tasks import Task
 from apnpql_jax.training.rollout import (
   Episodes,
   Player,
@@ -149,8 +150,19 @@ def load_trained(
   check_env(env_config)
   checkpoint_reader.restore(run_dir, step, {}, config=config)  # Fails early.
   env = make_env(env_config, instants=config.agent.lstm_instants)
+  return Trained(config, env, *load_agent(run_dir, config, env.task, step=step))
+
+
+def load_agent(
+  run_dir: Path, config: TrainConfig, task: Task, *, step: int | None
+) -> tuple[Agent, Params, int]:
+  """Restores the weights of a run, without building worlds.
+
+  Returns:
+    The agent, the parameters that act, and the step of the checkpoint.
+  """
   agent = make_agent(config.agent)
-  shapes = observation_shapes(config.env, env.task, instants=config.agent.lstm_instants)
+  shapes = observation_shapes(config.env, task, instants=config.agent.lstm_instants)
   learner = jax.eval_shape(agent.init, jax.random.key(0), shapes)
   example = {"target_params": learner.target_params}
   devices.check_memory(leaves.nbytes(example), "the network")
@@ -159,8 +171,7 @@ def load_trained(
     found = checkpoint_reader.restore(run_dir, step, wanted, config=config, partly=True)
   for line in found.damaged:
     print_line(line)
-  params = found.items["learner"]["target_params"]
-  return Trained(config, env, agent, params, found.step)
+  return agent, found.items["learner"]["target_params"], found.step
 
 
 def evaluate_expert(
