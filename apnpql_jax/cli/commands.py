@@ -121,7 +121,7 @@ def collect(args: Collect) -> Json:
   if args.save is not None:
     _check_demonstrations(args.save, overwrite=args.overwrite, append=args.append)
   # The expert acts on privileged poses, so images are not needed.
-  env = dataclasses.replace(_task_env(args.task), backend=args.backend, obs="state")
+  env = dataclasses.replace(task_env(args.task), backend=args.backend, obs="state")
 
   from apnpql_jax.envs.env import make_env
   from apnpql_jax.training import expert
@@ -144,7 +144,7 @@ def convert(args: Convert) -> Json:
   _check_demonstrations(out, overwrite=args.overwrite, append=args.append)
   if args.append and recording.resolve() == out.resolve():
     raise ConfigError(f"{out} cannot be added to itself")
-  env = _task_env(args.task)
+  env = task_env(args.task)
 
   from apnpql_jax import devices, tasks
   from apnpql_jax.data import demonstrations, real_arm
@@ -296,7 +296,7 @@ def _check_free(path: Path | None, *, overwrite: bool) -> None:
     raise ConfigError(f"{path} exists; replace it with --overwrite, or name another")
 
 
-def _task_env(task: str) -> EnvConfig:
+def task_env(task: str) -> EnvConfig:
   """Returns the environment of a task that exists, or of the preset in its file."""
   if user_files.is_file(task):
     return files.load_preset(task).env

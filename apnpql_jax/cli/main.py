@@ -20,6 +20,7 @@ from apnpql_jax.cli.new_task import NewTask, new_task
 from apnpql_jax.cli.options import Train, parse
 from apnpql_jax.cli.plot import Plot, plot
 from apnpql_jax.cli.sweep import Sweep, parse_sweep, sweep
+from apnpql_jax.cli.transfer import Transfer, transfer
 from apnpql_jax.config import files
 from apnpql_jax.console import Unfailing, print_line, reporting
 from apnpql_jax.errors import ConfigError, UserError, check_name
@@ -182,6 +183,7 @@ _COMMANDS: dict[str, tuple[type[Any], Callable[[Any], Json]]] = {
   "evaluate": (options.Evaluate, commands.evaluate),
   "diagnose": (options.Diagnose, commands.diagnose),
   "export": (Export, export),
+  "transfer": (Transfer, transfer),
   "collect": (options.Collect, commands.collect),
   "convert": (options.Convert, commands.convert),
   "repeat": (options.Repeat, commands.repeat),

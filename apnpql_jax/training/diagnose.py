@@ -108,11 +108,10 @@ def make_recorder(env: Env, agent: Agent, config: AgentConfig) -> Recorder:
     predicted, label = heads.primitives(), state.timestep.primitives
     # The last component is a logit in the prediction and a command in the label.
     wrong = (predicted[..., ARM_DOF] > 0.0) != (label[..., ARM_DOF] > 0.5)
-    followed = _arm_error(label, env.expert_action(state)[:, None])
     return action, Instants(
       active=~state.timestep.last,
       solved=state.timestep.terminated,
-      stage=jnp.argmin(followed, axis=-1),
+      stage=stage_of(env, state),
       error=_arm_error(predicted, label),
       gripper=wrong,
       kl=algorithm.policy_update(heads, prior, kl_key).kl,
@@ -134,6 +133,12 @@ def make_recorder(env: Env, agent: Agent, config: AgentConfig) -> Recorder:
     return jax.lax.scan(period, start, keys)[1]
 
   return record
+
+
+def stage_of(env: Env, state: EnvState) -> Array:
+  """Returns the stage of each world i32[worlds], an index into ``PRIMITIVES``."""
+  expert = env.expert_action(state)[:, None]
+  return jnp.argmin(_arm_error(state.timestep.primitives, expert), axis=-1)
 
 
 def _arm_error(a: Array, b: Array) -> Array:
@@ -158,7 +163,10 @@ def summarize(instants: Instants, config: AgentConfig) -> dict[str, Any]:
   groups = np.array_split(np.argsort(q), BINS)
   return {
     "failures": dict(
-      Counter(_end(instants, world) for world in np.flatnonzero(~solved))
+      Counter(
+        end_of(instants.stage[active[:, world], world])
+        for world in np.flatnonzero(~solved)
+      )
     ),
     "stages": stages,
     "kl_over_epsilon": _quantiles(instants.kl[active] / config.epsilon),
@@ -170,9 +178,11 @@ def summarize(instants: Instants, config: AgentConfig) -> dict[str, Any]:
   }
 
 
-def _end(instants: Instants, world: int) -> str:
-  """Names the last stage of an episode, and the farthest one if it had come farther."""
-  stages = instants.stage[instants.active[:, world], world]
+def end_of(stages: Array | np.ndarray) -> str:
+  """Names the last stage of an episode, and the farthest one if it had come farther.
+
+  ``stages`` i32[time] are those of its instants.
+  """
   last, farthest = PRIMITIVES[stages[-1]], PRIMITIVES[stages.max()]
   return last if last == farthest else f"{last} after {farthest}"
 
