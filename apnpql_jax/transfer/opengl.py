@@ -8,18 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import functools
-import importlib
-import os
 from typing import Any
 
 import mujoco
 import numpy as np
 
 from apnpql_jax.config.schema import EnvConfig
-from apnpql_jax.errors import ConfigError, one_line
 from apnpql_jax.render import Lighting
 from apnpql_jax.sim.scene import Scene, compile_file
 from apnpql_jax.transfer import looks
+from apnpql_jax.transfer.graphics import area_resized, off_screen
 
 CAMERAS = ("global", "wrist")
 OVERSAMPLING = 2
@@ -67,7 +65,7 @@ class OpenGL:
     model.vis.global_.offheight, model.vis.global_.offwidth = height, width
     model.vis.quality.offsamples = 0  # Oversampled instead.
     model.vis.quality.shadowsize = SHADOW_SIZE
-    self._gl = _context(int(width), int(height))
+    self._gl = off_screen(int(width), int(height))
     self._scene = mujoco.MjvScene(model, model.ngeom + 64)
     self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = unseen or config.shadows
     self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
@@ -183,13 +181,6 @@ class OpenGL:
     self._scene.ngeom += 1
 
 
-def area_resized(image: np.ndarray, factor: int) -> np.ndarray:
-  """Returns the means of blocks of factor x factor pixels, u8[H, W, 3]."""
-  height, width = image.shape[0] // factor, image.shape[1] // factor
-  blocks = image.reshape(height, factor, width, factor, 3).astype(np.float32)
-  return (blocks.mean((1, 3)) + 0.5).astype(np.uint8)
-
-
 @functools.lru_cache(maxsize=256)
 def _look(row: int, bodies: int) -> looks.Look:
   return looks.draw(row, bodies)
@@ -246,20 +237,3 @@ def _name(kind: str, index: int) -> str:
 
 def _unit(vector: Any) -> np.ndarray:
   return np.asarray(vector) / np.linalg.norm(vector)
-
-
-def _context(width: int, height: int) -> Any:
-  """Returns a current OpenGL context without a window."""
-  chosen = os.environ.get("MUJOCO_GL", "")
-  reasons = []
-  for library in [chosen] if chosen in ("egl", "osmesa") else ["egl", "osmesa"]:
-    try:
-      context = importlib.import_module(f"mujoco.{library}").GLContext(width, height)
-      context.make_current()
-      return context
-    except Exception as error:  # Whatever a missing library causes.
-      reasons.append(f"{library}: {one_line(error)}")
-  raise ConfigError(
-    "--renderer opengl needs EGL or OSMesa (Debian: libegl1 with libegl-mesa0, or "
-    f"libosmesa6); {'; '.join(reasons)}"
-  )
