@@ -69,13 +69,15 @@ def test_the_task_of_the_guide_runs(tmp_path: Path):
   given = ("--task-file", file)
   evaluate = ("evaluate", "runs/touch_ball-1", "--episodes", "4")
   resume = ("train", "--resume", "runs/touch_ball-1", "--total-steps", "32")
+  export = ("export", "runs/touch_ball-1", "policy")
   # A run alone never makes a process execute the file that it names.
-  for command in (evaluate, resume):
+  for command in (evaluate, resume, export):
     line = refusal(tmp_path, *command)
     assert f"'touch_ball' is in {tmp_path / 'touch_ball.py'}" in line
     assert "--task-file" in line
   assert result(tmp_path, *evaluate, *given)["task"] == "touch_ball"
   assert result(tmp_path, *resume, *given)["env_steps"] == 32
+  assert result(tmp_path, *export, *given)["task"] == "touch_ball"
   scene = tmp_path / "touch_ball.xml"
   scene.write_text(scene.read_text().replace('size="0.03"', 'size="0.04"'))
   done = run(tmp_path, *evaluate, *given)

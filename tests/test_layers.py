@@ -12,8 +12,8 @@ NAME = PACKAGE.name
 
 STAIR = (
   "errors types atomic console runtime dists config devices sim render tasks templates "
-  "randomization primitives envs gym agents data runs reports sweeps training "
-  "viewing testing doctor cli __main__"
+  "randomization primitives envs gym agents data runs reports sweeps training viewing "
+  "deploy transfer testing doctor cli __main__"
 ).split()
 """Rooms from the bottom up: each imports only from itself and from earlier ones."""
 

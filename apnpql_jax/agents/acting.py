@@ -19,6 +19,9 @@ from apnpql_jax.dists.gmm import GripperGMM
 from apnpql_jax.errors import check_name
 from apnpql_jax.types import Array, Metrics
 
+SURE = ("mean", "greedy")
+"""Rules that put all weight on one candidate."""
+
 
 def choose_action(
   algorithm: Algorithm, heads: Heads, key: PRNGKeyArray, *, acting: str
@@ -44,7 +47,10 @@ def choose_action(
   key_candidates, key_pick = jax.random.split(key)
   candidates = _candidates(algorithm, heads, key_candidates, acting)
   q_values, weights = candidates.q_values, candidates.weights
-  chosen = boltzmann.pick(key_pick, weights)
+  if acting in SURE:
+    chosen = jnp.argmax(weights, axis=0)
+  else:
+    chosen = boltzmann.pick(key_pick, weights)
   actions = jnp.take_along_axis(candidates.actions, chosen[None, :, None], axis=0)
   q = jnp.take_along_axis(q_values, chosen[None], axis=0)
   info = {

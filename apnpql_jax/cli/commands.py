@@ -82,7 +82,7 @@ def train(args: Train) -> Json:
 
 def evaluate(args: Evaluate) -> Json:
   """Plays held-out episodes with a checkpoint of a run."""
-  run_dir = _existing_run(args.run, "evaluate", args.task_file)
+  run_dir = existing_run(args.run, "evaluate", args.task_file)
   check_free(args.video, overwrite=args.overwrite)
 
   from apnpql_jax.training.evaluate import evaluate as evaluate_run
@@ -101,7 +101,7 @@ def evaluate(args: Evaluate) -> Json:
 
 def diagnose(args: Diagnose) -> Json:
   """Reports what limits the success of a trained agent."""
-  run_dir = _existing_run(args.run, "diagnose", args.task_file)
+  run_dir = existing_run(args.run, "diagnose", args.task_file)
 
   from apnpql_jax.training.diagnose import diagnose as diagnose_run
 
@@ -228,7 +228,7 @@ def _mesh(args: Train) -> Mesh | None:
   return devices.make_mesh(0)
 
 
-def _existing_run(run: str, command: str, task_file: Path | None) -> Path:
+def existing_run(run: str, command: str, task_file: Path | None) -> Path:
   """Returns the folder of a run; raises ``UserError`` if it is not one."""
   if not run:
     raise ConfigError(f"{command} needs a run folder: apnpql {command} RUN")
@@ -307,7 +307,7 @@ def task_env(task: str) -> EnvConfig:
   return files.task_env(task)
 
 
-def checkpoint_step(run: str, checkpoint: str) -> int | None:
+def checkpoint_step(run: Path | str, checkpoint: str) -> int | None:
   """Returns the step of the checkpoint asked for; None for the newest."""
   if checkpoint == "newest":
     return None

@@ -17,10 +17,12 @@ from apnpql_jax.cli.commands import Json
 from apnpql_jax.cli.compare import Compare, compare
 from apnpql_jax.cli.completion import Completion, completion
 from apnpql_jax.cli.doctor import Doctor, doctor
+from apnpql_jax.cli.export import Export, export
 from apnpql_jax.cli.new_task import NewTask, new_task
 from apnpql_jax.cli.options import Train, parse
 from apnpql_jax.cli.plot import Plot, plot
 from apnpql_jax.cli.sweep import Sweep, parse_sweep, sweep
+from apnpql_jax.cli.transfer import Transfer, transfer
 from apnpql_jax.config import files
 from apnpql_jax.console import Unfailing, print_line, reporting
 from apnpql_jax.errors import ConfigError, UserError, check_name
@@ -189,6 +191,8 @@ _COMMANDS: dict[str, tuple[type[Any], Callable[[Any], Json]]] = {
   "evaluate": (options.Evaluate, commands.evaluate),
   "diagnose": (options.Diagnose, commands.diagnose),
   "watch": (watch.Watch, watch.watch),
+  "export": (Export, export),
+  "transfer": (Transfer, transfer),
   "collect": (options.Collect, commands.collect),
   "convert": (options.Convert, commands.convert),
   "repeat": (options.Repeat, commands.repeat),

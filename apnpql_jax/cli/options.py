@@ -19,15 +19,16 @@ from apnpql_jax.errors import ConfigError
 T = TypeVar("T")
 
 
-def _default_hint(text: str) -> object:
+def default_hint(text: str) -> object:
+  """Returns the annotation of an option whose help describes its default."""
   return tyro.conf.arg(help_behavior_hint=text)
 
 
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
-_OfPreset = Annotated[str | None, _default_hint("(default: as in the preset)")]
-Count = Annotated[int | None, _default_hint("")]
-AsTrained = Annotated[str | None, _default_hint("(default: as in training)")]
-File = Annotated[Path | None, _default_hint("")]
+_OfPreset = Annotated[str | None, default_hint("(default: as in the preset)")]
+Count = Annotated[int | None, default_hint("")]
+AsTrained = Annotated[str | None, default_hint("(default: as in training)")]
+File = Annotated[Path | None, default_hint("")]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,15 +80,15 @@ class Train(OfRun):
   """Preset to start from; `apnpql list` shows all. Or the path of a file with a preset
   and its task, such as ./my_task.py."""
 
-  run: Annotated[
-    Path | None, _default_hint("(default: first free runs/PRESET-<n>)")
-  ] = None
+  run: Annotated[Path | None, default_hint("(default: first free runs/PRESET-<n>)")] = (
+    None
+  )
   """Run folder to create."""
 
   resume: File = None
   """Run folder to resume from its latest checkpoint."""
 
-  init_from: Annotated[str | None, _default_hint("")] = None
+  init_from: Annotated[str | None, default_hint("")] = None
   """Run with whose weights the new one starts: RUN (its newest checkpoint), RUN:STEP or
   RUN:best."""
 

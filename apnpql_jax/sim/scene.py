@@ -32,6 +32,7 @@ class Scene:
   """A compiled model and the addresses of the robot in it."""
 
   name: str  # stem of the MJCF file
+  path: pathlib.Path  # of the MJCF file
   model: mujoco.MjModel
   fingerprint: str  # hash of the compiled models of all variants
   arm_qpos: np.ndarray  # int[6]: addresses of the arm joints in qpos
@@ -79,7 +80,7 @@ def load_scene(
     ConfigError: The file does not compile, lacks a joint, site or camera, uses a
       feature that MJX would silently ignore, or changes the robot.
   """
-  models = [_compile(path, edit) for edit in variants or [lambda _: None]]
+  models = [compile_file(path, edit) for edit in variants or [lambda _: None]]
   model = models[0]
   scene_checks.check_supported(model, path.stem)
   joints = [_named_id(model, path.stem, "joint", name) for name in ARM_JOINTS]
@@ -91,6 +92,7 @@ def load_scene(
     scene_checks.check_keyframes(variant, path.stem)
   return Scene(
     name=path.stem,
+    path=path,
     model=model,
     fingerprint=_fingerprint(models),
     arm_qpos=model.jnt_qposadr[joints].copy(),
@@ -118,9 +120,14 @@ def _named_id(model: mujoco.MjModel, scene: str, kind: str, name: str) -> int:
     raise ConfigError(f"{scene}.xml has no {kind} '{name}' (valid: {valid})") from None
 
 
-def _compile(
+def compile_file(
   path: pathlib.Path, edit: Callable[[mujoco.MjSpec], None]
 ) -> mujoco.MjModel:
+  """Compiles an MJCF file after ``edit`` has changed what was parsed.
+
+  Raises:
+    ConfigError: It does not compile.
+  """
   try:
     # A file elsewhere may include the robot and its surroundings by name.
     shared = {

@@ -163,7 +163,10 @@ def summarize(instants: Instants, config: AgentConfig) -> dict[str, Any]:
   groups = np.array_split(np.argsort(q), BINS)
   return {
     "failures": dict(
-      Counter(_end(instants, world) for world in np.flatnonzero(~solved))
+      Counter(
+        end_of(instants.stage[active[:, world], world])
+        for world in np.flatnonzero(~solved)
+      )
     ),
     "stages": stages,
     "kl_over_epsilon": _quantiles(instants.kl[active] / config.epsilon),
@@ -175,9 +178,11 @@ def summarize(instants: Instants, config: AgentConfig) -> dict[str, Any]:
   }
 
 
-def _end(instants: Instants, world: int) -> str:
-  """Names the last stage of an episode, and the farthest one if it had come farther."""
-  stages = instants.stage[instants.active[:, world], world]
+def end_of(stages: Array | np.ndarray) -> str:
+  """Names the last stage of an episode, and the farthest one if it had come farther.
+
+  ``stages`` i32[time] are those of its instants.
+  """
   last, farthest = PRIMITIVES[stages[-1]], PRIMITIVES[stages.max()]
   return last if last == farthest else f"{last} after {farthest}"
 

@@ -25,6 +25,7 @@ from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.primitives import reset_bank
 from apnpql_jax.runs import abandoned_tasks, checkpoint_reader, leaves, run_folder
 from apnpql_jax.runs.metrics import wilson_interval
+from apnpql_jax.tasks import Task
 from apnpql_jax.training.rollout import (
   Episodes,
   Player,
@@ -169,18 +170,27 @@ def load_trained(
   env_config = dataclasses.replace(config.env, backend=backend or config.env.backend)
   check_env(env_config)
   checkpoint_reader.restore(run_dir, step, {}, config=config)  # Fails early.
-  seed = reset_bank.SEED
+  seed, instants = reset_bank.SEED, config.agent.lstm_instants
   if fresh is not None:
     rows = max(MIN_BANK_ROWS, math.ceil(fresh.held_out / HELD_OUT_SHARE))
     seed, env_config = fresh.seed, dataclasses.replace(env_config, bank_rows=rows)
-  instants = config.agent.lstm_instants
   env = make_env(env_config, instants=instants, bank_seed=seed)
+  return Trained(config, env, *load_agent(run_dir, config, env.task, step=step))
+
+
+def load_agent(
+  run_dir: Path, config: TrainConfig, task: Task, *, step: int | None
+) -> tuple[Agent, Params, int]:
+  """Restores the weights of a run, without building worlds.
+
+  Returns:
+    The agent, the parameters that act, and the step of the checkpoint.
+  """
   agent = make_agent(config.agent)
-  shapes = observation_shapes(config.env, env.task, instants=instants)
+  shapes = observation_shapes(config.env, task, instants=config.agent.lstm_instants)
   learner = jax.eval_shape(agent.init, jax.random.key(0), shapes)
   devices.check_memory(leaves.nbytes(learner.target_params), "the network")
-  params, step = load_params(run_dir, config, learner.target_params, step)
-  return Trained(config, env, agent, params, step)
+  return agent, *load_params(run_dir, config, learner.target_params, step)
 
 
 def load_params(

@@ -1,0 +1,57 @@
+"""The command ``apnpql export``."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from apnpql_jax.cli.commands import checkpoint_step, existing_run
+from apnpql_jax.cli.options import Flag, OfRun, default_hint
+from apnpql_jax.errors import ConfigError
+
+
+@dataclasses.dataclass(frozen=True)
+class Export(OfRun):
+  """Exports a policy to use without this package: apnpql export RUN FOLDER [options].
+
+  FOLDER gets the program with its weights, a contract in JSON, and an example.
+
+  apnpql export runs/mine policy
+
+  apnpql export runs/mine policy --checkpoint best --acting mean
+  """
+
+  run: tyro.conf.Positional[str] = ""
+  """Run folder."""
+
+  folder: tyro.conf.Positional[str] = ""
+  """Folder to make."""
+
+  checkpoint: str = "newest"
+  """Checkpoint: newest, best (highest success rate in training) or its step."""
+
+  acting: Annotated[str | None, default_hint("(default: as in training)")] = None
+  """How to choose an action, see `apnpql evaluate --help`. Only mean needs no key."""
+
+  overwrite: Flag = False
+  """Replace an earlier export."""
+
+
+def export(args: Export) -> dict[str, Any]:
+  """Writes the folder of an exported policy and returns what it holds."""
+  run_dir = existing_run(args.run, "export", args.task_file)
+  if not args.folder:
+    raise ConfigError("export needs a folder to make: apnpql export RUN FOLDER")
+
+  from apnpql_jax.deploy.export import export as export_run
+
+  return export_run(
+    run_dir,
+    Path(args.folder),
+    step=checkpoint_step(args.run, args.checkpoint),
+    acting=args.acting,
+    overwrite=args.overwrite,
+  )

@@ -1,0 +1,87 @@
+"""The command ``apnpql transfer``."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from apnpql_jax.cli.commands import checkpoint_step, existing_run, task_env
+from apnpql_jax.cli.options import OfRun, default_hint
+from apnpql_jax.errors import ConfigError
+
+EXPERT = "expert"
+
+
+@dataclasses.dataclass(frozen=True)
+class Transfer(OfRun):
+  """Plays a policy in another simulator: apnpql transfer RUN [options].
+
+  The scripted expert sees no images. Where it solves less than 95 %, a cell says nothing
+  about a policy.
+
+  apnpql transfer runs/mine --renderer opengl --looks unseen
+
+  apnpql transfer expert --task stack_box --physics mjx
+  """
+
+  run: tyro.conf.Positional[str] = ""
+  """Run folder, or expert."""
+
+  task: str = ""
+  """Task of the expert, or the path of its file; `apnpql list` shows all."""
+
+  physics: str = "native"
+  """Engine: mjx or native (C MuJoCo)."""
+
+  renderer: str = "rays"
+  """What draws the images: rays (as in training) or opengl (MuJoCo's renderer)."""
+
+  looks: str = "trained"
+  """trained: worlds that domain randomization draws; plain: no randomization; unseen:
+  textures, lights, shadows, clutter and noise that it cannot draw."""
+
+  checkpoint: str = "newest"
+  """Checkpoint: newest, best (highest success rate in training) or its step."""
+
+  acting: Annotated[str | None, default_hint("(default: as in training)")] = None
+  """How to choose an action, see `apnpql evaluate --help`."""
+
+  episodes: int = 200
+  """Number of held-out episodes."""
+
+  seed: int = 0
+  """Random seed of the episodes and of the policy."""
+
+
+def transfer(args: Transfer) -> dict[str, Any]:
+  """Plays the episodes of one cell and returns their figures."""
+  if not args.run:
+    raise ConfigError(
+      "transfer needs a run or expert: apnpql transfer RUN, or apnpql transfer expert "
+      "--task TASK"
+    )
+  expert = args.run == EXPERT and not Path(EXPERT, "config.json").exists()
+  if expert != bool(args.task):
+    raise ConfigError("--task names the task of the expert; runs have their own")
+  common = {"episodes": args.episodes, "seed": args.seed}
+  if expert:
+    env = task_env(args.task)
+
+    from apnpql_jax.transfer.transfer import Cell, transfer_expert
+
+    cell = Cell(args.physics, args.renderer, args.looks)
+    return transfer_expert(env, cell, **common)
+  run_dir = existing_run(args.run, "transfer", args.task_file)
+
+  from apnpql_jax.transfer.transfer import Cell, transfer as transfer_run
+
+  return transfer_run(
+    run_dir,
+    Cell(args.physics, args.renderer, args.looks),
+    step=checkpoint_step(args.run, args.checkpoint),
+    acting=args.acting,
+    **common,
+  )

@@ -1,0 +1,1 @@
+"""Transfer between simulators: other physics, other renderers, other looks."""

@@ -1,0 +1,98 @@
+"""Episodes whose physics and images may come from outside of JAX.
+
+The loop over time is in Python. With the engine and the cameras of the environment it
+plays the same episodes as ``training.rollout.make_player``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
+import numpy as np
+
+from apnpql_jax.envs.env import Env
+from apnpql_jax.envs.state import EnvState
+from apnpql_jax.training.diagnose import expert_stage
+from apnpql_jax.types import Array, Observation
+
+Draw = Callable[[EnvState, np.ndarray, np.ndarray, int], tuple[Array, Array]]
+"""(worlds, bank rows, worlds that still run, instant) -> images u8[worlds, H, W, 3] of
+the global and the wrist camera."""
+
+Act = Callable[[EnvState, Observation, PRNGKeyArray], Array]
+"""(worlds, observation, key) -> actions f32[worlds, 7]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Played:
+  """One episode per world."""
+
+  success: np.ndarray  # bool[worlds]
+  length: np.ndarray  # i32[worlds], control periods
+  stages: list[np.ndarray]  # i32[length] each: stage at every instant but the last
+
+
+def play(
+  env: Env,
+  act: Act,
+  rows: Array,
+  key: PRNGKeyArray,
+  *,
+  draw: Draw | None = None,
+  instants: int = 0,
+) -> Played:
+  """Plays one episode per row of the bank; a world that breaks counts as failed.
+
+  Args:
+    env: The worlds.
+    act: The policy.
+    rows: Rows of the bank, i32[worlds].
+    key: Key of actions and resets.
+    draw: Draws the images; those of ``env``, if any, if None.
+    instants: L of ``EnvState.recent``, with ``draw``.
+  """
+  count = len(rows)
+  running, success = np.ones(count, bool), np.zeros(count, bool)
+  length, stages = np.zeros(count, np.int32), []
+  watch = jax.jit(lambda state: expert_stage(env, state))
+  state, recent = env.reset(rows), None
+  for time in range(env.config.episode_steps + 1):
+    running = running & (np.asarray(state.faults) == 0)
+    success |= running & np.asarray(state.timestep.terminated)
+    length = np.where(running, np.asarray(state.elapsed), length)
+    running = running & ~np.asarray(state.timestep.last)
+    stages.append(np.where(running, np.asarray(watch(state)), -1))
+    if not running.any():
+      break
+    seen = state.observation
+    if draw is not None:
+      images = draw(state, np.asarray(rows), running, time)
+      seen = with_images(state.timestep.observation, images)
+      if instants:
+        recent = _pushed(recent, seen, instants)
+        seen = recent
+    key, policy_key, env_key = jax.random.split(key, 3)
+    state = env.step(state, act(state, seen, policy_key), env_key)
+  active = np.stack(stages)
+  kept = [x[x >= 0] for x in active.T]
+  return Played(success, length, kept)
+
+
+def with_images(observation: Observation, images: tuple[Array, Array]) -> Observation:
+  """Returns the observation with images in place of the points on the objects."""
+  overview, wrist = images
+  return observation.replace(objects=None, global_image=overview, wrist_image=wrist)
+
+
+def _pushed(recent: Any, new: Any, instants: int) -> Any:
+  """Returns the last observations [worlds, L, ...]; the first one is repeated."""
+  if recent is None:
+    return jax.tree.map(lambda x: jnp.repeat(x[:, None], instants, axis=1), new)
+  return jax.tree.map(
+    lambda old, x: jnp.concatenate([old[:, 1:], x[:, None]], axis=1), recent, new
+  )

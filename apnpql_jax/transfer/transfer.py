@@ -1,0 +1,220 @@
+"""Held-out episodes of a policy or of the expert in worlds that training did not have.
+
+A cell is a choice of physics, renderer and looks. The expert acts on privileged poses,
+so that its success depends on the physics alone. Where it fails, a cell says nothing
+about a policy.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+import contextlib
+import dataclasses
+from pathlib import Path
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from apnpql_jax import devices
+from apnpql_jax.config.checks import ACTING
+from apnpql_jax.config.schema import EnvConfig, TrainConfig
+from apnpql_jax.envs.env import Env, make_env
+from apnpql_jax.envs.state import EnvState
+from apnpql_jax.errors import ConfigError, check_name
+from apnpql_jax.runs import checkpoint_reader, run_folder
+from apnpql_jax.runs.metrics import wilson_interval
+from apnpql_jax.sim.kinematics import make_kinematics
+from apnpql_jax.training.diagnose import end_of
+from apnpql_jax.training.evaluate import check_count, held_out_batches, load_agent
+from apnpql_jax.transfer import looks
+from apnpql_jax.transfer.opengl import OpenGL
+from apnpql_jax.transfer.play import Act, Draw, Played, play
+from apnpql_jax.types import Array
+
+PHYSICS = ("mjx", "native")
+RENDERERS = ("rays", "opengl")
+LOOKS = ("trained", "plain", "unseen")
+
+EXPERT_SUFFICES = 0.95
+"""Success rate of the expert from which on a cell tells something about a policy."""
+
+_POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat")
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+  """What the worlds of a test consist of."""
+
+  physics: str = "native"
+  """Engine, one of ``PHYSICS``."""
+
+  renderer: str = "rays"
+  """What draws the images, one of ``RENDERERS``."""
+
+  looks: str = "trained"
+  """trained: worlds that domain randomization draws, within the ranges of the run,
+  physics included; plain: those of the scene file; unseen: see ``looks``."""
+
+  def check(self) -> None:
+    """Raises ``ConfigError`` if there is no such cell."""
+    check_name("--physics", self.physics, PHYSICS)
+    check_name("--renderer", self.renderer, RENDERERS)
+    check_name("--looks", self.looks, LOOKS)
+    if self.looks == "unseen" and self.renderer == "rays":
+      raise ConfigError("--looks unseen needs --renderer opengl")
+
+
+def transfer(
+  run_dir: Path | str,
+  cell: Cell,
+  *,
+  episodes: int = 200,
+  seed: int = 0,
+  step: int | None = None,
+  acting: str | None = None,
+) -> dict[str, Any]:
+  """Plays held-out episodes of a cell with a checkpoint of a run.
+
+  ``step`` and ``acting`` are as in ``evaluate``.
+
+  Returns:
+    Success rate with its Wilson interval, and failures by their last stage, as in
+    ``diagnose``.
+
+  Raises:
+    ConfigError: An argument is invalid, or a package or library is missing.
+    FileError: Not a run folder, or no readable checkpoint.
+  """
+  began = time.monotonic()
+  cell.check()
+  check_count(episodes, seed)
+  if acting is not None:
+    check_name("acting", acting, ACTING)
+  run_dir = Path(run_dir)
+  config = run_folder.open_run(run_dir).config
+  if config.env.obs != "pixels":
+    raise ConfigError(
+      f"{run_dir} was trained with --obs {config.env.obs}; transfer needs pixels"
+    )
+  checkpoint_reader.restore(run_dir, step, {}, config=config)  # Fails early.
+  instants = config.agent.lstm_instants
+  outside = cell.renderer != "rays"
+  obs = "state" if outside else "pixels"  # Others draw the images.
+  env = _make_env(config.env, cell, obs, instants=0 if outside else instants)
+  agent, params, step = load_agent(run_dir, config, env.task, step=step)
+  acting = acting or config.eval_acting
+  choose = jax.jit(lambda p, seen, key: agent.act(p, seen, key, acting=acting)[0])
+
+  def act(state: EnvState, seen: Any, key: Array) -> Array:
+    del state
+    return choose(params, seen, key)
+
+  with contextlib.ExitStack() as stack:
+    draw = None
+    if outside:
+      unseen = cell.looks == "unseen"
+      gl = stack.enter_context(OpenGL(env.task.scene, config.env, unseen=unseen))
+      draw = make_draw(env, gl)
+    played = _play_all(
+      env, act, episodes, seed, draw=draw, instants=instants if outside else 0
+    )
+  about = {"checkpoint_step": step, "acting": acting, "trained": _training(config)}
+  return _summary(config.env.task, cell, about, played, began)
+
+
+def transfer_expert(
+  env_config: EnvConfig, cell: Cell, *, episodes: int = 200, seed: int = 0
+) -> dict[str, Any]:
+  """Plays held-out episodes of a cell with the scripted expert; see ``transfer``.
+
+  The expert sees no images. ``sufficient`` is whether it reaches ``EXPERT_SUFFICES``.
+  """
+  began = time.monotonic()
+  cell.check()
+  check_count(episodes, seed)
+  env = _make_env(env_config, cell, "state", instants=0)
+  choose = jax.jit(env.expert_action)
+
+  def act(state: EnvState, seen: Any, key: Array) -> Array:
+    del seen, key
+    return choose(state)
+
+  played = _play_all(env, act, episodes, seed)
+  found = _summary(env_config.task, cell, {"algorithm": "expert"}, played, began)
+  return found | {"sufficient": found["success_rate"] >= EXPERT_SUFFICES}
+
+
+def make_draw(env: Env, gl: OpenGL) -> Draw:
+  """Returns a function that draws all running worlds; others stay black."""
+  poses_of = make_kinematics(env.task.scene)
+  sizes = env.config.global_size, env.config.wrist_size
+
+  def draw(
+    state: EnvState, rows: np.ndarray, running: np.ndarray, instant: int
+  ) -> tuple[Array, Array]:
+    kinematics = poses_of(state.physics)
+    poses = {name: np.asarray(getattr(kinematics, name)) for name in _POSES}
+    fields = {name: np.asarray(x) for name, x in state.physics.fields.items()}
+    images = [np.zeros((len(rows), *size, 3), np.uint8) for size in sizes]
+    for world in np.flatnonzero(running):
+      views = gl.draw(
+        {name: x[world] for name, x in poses.items()},
+        {name: x[world] for name, x in fields.items()},
+        int(rows[world]),
+        instant,
+      )
+      for image, view in zip(images, views, strict=True):
+        image[world] = view
+    overview, wrist = map(jnp.asarray, images)
+    return overview, wrist
+
+  return draw
+
+
+def _make_env(config: EnvConfig, cell: Cell, obs: str, *, instants: int) -> Env:
+  devices.start()
+  config = dataclasses.replace(
+    config, backend=cell.physics, randomize=cell.looks == "trained", obs=obs
+  )
+  return make_env(config, instants=instants)
+
+
+def _play_all(
+  env: Env, act: Act, episodes: int, seed: int, **options: Any
+) -> list[Played]:
+  return [
+    play(env, act, rows, key, **options)
+    for rows, key in held_out_batches(env, episodes=episodes, seed=seed)
+  ]
+
+
+def _training(config: TrainConfig) -> str:
+  return "randomized" if config.env.randomize else "plain"
+
+
+def _summary(
+  task: str, cell: Cell, about: dict[str, Any], played: list[Played], began: float
+) -> dict[str, Any]:
+  episodes = sum(len(x.success) for x in played)
+  success = np.concatenate([x.success for x in played])
+  stages = [stage for x in played for stage in x.stages]
+  solved = int(success.sum())
+  failures = Counter(
+    end_of(stages[i]) for i in np.flatnonzero(~success) if len(stages[i])
+  )
+  return {
+    "task": task,
+    **dataclasses.asdict(cell),
+    **({"looks_version": looks.VERSION} if cell.looks == "unseen" else {}),
+    **about,
+    "episodes": episodes,
+    "successes": solved,
+    "success_rate": solved / episodes,
+    "ci95": wilson_interval(solved, episodes),
+    "mean_length": float(np.concatenate([x.length for x in played]).mean()),
+    "failures": dict(failures),
+    "wall_s": time.monotonic() - began,
+  }
