@@ -19,8 +19,8 @@ EXPERT = "expert"
 class Transfer(OfRun):
   """Plays a policy in another simulator: apnpql transfer RUN [options].
 
-  The scripted expert sees no images. Where it solves less than 95 %, a cell says nothing
-  about a policy.
+  The scripted expert sees no images. Where it solves less than 95 %, a cell says
+  nothing about a policy.
 
   apnpql transfer runs/mine --renderer opengl --looks unseen
 
