@@ -213,7 +213,8 @@ def stable_baselines(report: Report) -> Prepared:
   for result in report["results"]:
     curve = result["curve"]
     best = percent(max(point["success_rate"] for point in curve))
-    rows.append(result | curve[-1] | {"best": best})
+    reached = result["minutes_to_80"] or "not reached"
+    rows.append(result | curve[-1] | {"best": best, "minutes_to_80": reached})
   return rows, []
 
 
