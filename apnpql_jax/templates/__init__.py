@@ -1,0 +1,1 @@
+"""Files that `apnpql new-task` copies: a complete task to change."""
