@@ -19,6 +19,7 @@ _EXTRAS = "extras"
 
 EXTRAS = {
   "cuda": "trains on NVIDIA GPUs",
+  "export": "apnpql export",
   "gym": "Gymnasium environments",
   "sweep": "apnpql sweep --launcher slurm",
   "tb": "--sinks tensorboard",

@@ -23,8 +23,9 @@ class Work(NamedTuple):
     run_dir = str(self.run_dir)
     begun = (self.run_dir / CONFIG_FILE).is_file()
     rest = ["--resume", run_dir] if begun else [*self.argv, "--run", run_dir]
-    if begun and user_files.is_file(self.argv[0]):
-      rest += ["--task-file", self.argv[0]]
+    preset = self.argv[0] if self.argv else ""
+    if begun and user_files.is_file(preset):
+      rest += ["--task-file", preset]
     return [sys.executable, "-m", "apnpql_jax", "train", *rest]
 
 

@@ -64,11 +64,10 @@ class TableTask:
     chain = arm.make_chain(self.scene)
     self._neutral_pos, self._neutral_mat, _ = arm.forward(chain, neutral)
 
-  @classmethod
-  def _mjcf(cls) -> Path:
+  def _mjcf(self) -> Path:
     """Returns the path of the scene."""
-    beside = Path(inspect.getfile(cls)).with_name(f"{cls.name}.xml")
-    return beside if beside.is_file() else mjcf_path(cls.name)
+    beside = Path(inspect.getfile(type(self))).with_name(f"{self.name}.xml")
+    return beside if beside.is_file() else mjcf_path(self.name)
 
   def draw_qpos(self, rng: np.random.Generator, count: int) -> np.ndarray:
     """Draws neutral states with noise on the arm, f64[count, nq]."""

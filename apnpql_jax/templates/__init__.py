@@ -1,1 +1,1 @@
-"""Files that `apnpql new-task` copies: a complete task to change."""
+"""Files that commands copy: a task to change, and a script that uses an export."""
