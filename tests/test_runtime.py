@@ -51,7 +51,8 @@ def threads(env: dict[str, str], cores: int) -> int:
 def test_import_changes_no_variable_and_starts_no_backend():
   code = (
     "import json, os, pkgutil; import jax, mujoco.mjx, flax, distrax, mink;"
-    "import orbax.checkpoint, imageio, matplotlib, gymnasium; before = dict(os.environ);"
+    "import orbax.checkpoint, imageio, matplotlib, gymnasium;"
+    "before = dict(os.environ);"
     "import apnpql_jax;"
     "[__import__(m.name) for m in pkgutil.walk_packages(apnpql_jax.__path__,"
     " 'apnpql_jax.') if not m.name.endswith(('__main__', 'stable_baselines'))"
