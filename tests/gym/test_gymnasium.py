@@ -188,7 +188,7 @@ def test_stable_baselines_sees_the_ends_of_episodes():
   for world, info in enumerate(infos):
     assert info["TimeLimit.truncated"] and not info["is_success"]
     assert info["episode"]["l"] == 3
-    # The arm stood still; the observation is already that of the next episode.
-    joints = info["terminal_observation"]["robot"][-7:-1]  # Without the gripper.
-    np.testing.assert_allclose(joints, first["robot"][world, -7:-1], atol=1e-3)
-    assert abs(joints - observation["robot"][world, -7:-1]).max() > 1e-3
+    # The hand has opened; in the observation of the next episode it is closed again.
+    last, begun = info["terminal_observation"], observation["robot"][world]
+    assert last["robot"][-1] < first["robot"][world, -1] - 0.1
+    np.testing.assert_allclose(begun[-1], first["robot"][world, -1], atol=1e-3)
