@@ -8,7 +8,7 @@ import sys
 import textwrap
 
 _NARROWEST = 12
-"""Columns that a value needs beside its name; otherwise it goes below."""
+"""Columns that a value needs next to its name; with fewer, it is on the next line."""
 
 
 def width() -> int | None:

@@ -44,7 +44,7 @@ class Watch(OfRun):
 
   checkpoint: str = "newest"
   """Checkpoint: newest, best (highest success rate in training) or its step. The newest
-  is replaced by newer ones while a run goes on."""
+  is replaced by newer ones while a run trains."""
 
   acting: AsTrained = None
   """How to choose an action: policy, mean, prior or greedy, see apnpql evaluate."""

@@ -38,7 +38,7 @@ OF_WEIGHTS = (
 
 
 def check_resumed(saved: TrainConfig, wanted: TrainConfig, run: str) -> None:
-  """Checks that a run may go on with these settings.
+  """Checks that a run may resume with these settings.
 
   Raises:
     ConfigError: Settings outside of ``MAY_CHANGE`` differ; the message lists each, and

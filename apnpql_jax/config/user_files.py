@@ -71,7 +71,10 @@ def _module_name(path: Path) -> str:
 
 
 def digest(path: Path | str) -> str | None:
-  """Returns a SHA-256 of a task's file and of the MJCF beside it; None if missing."""
+  """Returns a SHA-256 of a task's file and of the MJCF files next to it.
+
+  Returns None if there is no such file.
+  """
   path = Path(path)
   if not path.is_file():
     return None

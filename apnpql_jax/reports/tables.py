@@ -50,7 +50,7 @@ def of_groups(groups: Sequence[Group]) -> Rows:
 
 
 def brief(groups: Sequence[Group]) -> Rows:
-  """Returns what of ``of_groups`` fits a terminal."""
+  """Returns the columns of ``of_groups`` that fit a terminal."""
   wanted = "task", "settings", "runs", "success", f"min to {100 * GOAL:.0f} %"
   head, *rows = of_groups(groups)
   columns = [index for index, name in enumerate(head) if name in wanted]

@@ -103,7 +103,7 @@ def open_run(run_dir: Path) -> RunFolder:
 
 
 def change(run_dir: Path, config: TrainConfig, *, step: int) -> str:
-  """Replaces the settings of a run that goes on from ``step``, and records the change.
+  """Replaces the settings of a run that resumes at ``step``, and records the change.
 
   Returns:
     The differences as one line, "" if there are none.

@@ -66,8 +66,8 @@ class TableTask:
 
   def _mjcf(self) -> Path:
     """Returns the path of the scene."""
-    beside = Path(inspect.getfile(type(self))).with_name(f"{self.name}.xml")
-    return beside if beside.is_file() else mjcf_path(self.name)
+    own = Path(inspect.getfile(type(self))).with_name(f"{self.name}.xml")
+    return own if own.is_file() else mjcf_path(self.name)
 
   def draw_qpos(self, rng: np.random.Generator, count: int) -> np.ndarray:
     """Draws neutral states with noise on the arm, f64[count, nq]."""

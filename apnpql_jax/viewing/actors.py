@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from apnpql_jax.config.checks import ACTING
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.envs.state import EnvState
-from apnpql_jax.errors import check_name
+from apnpql_jax.errors import FileError, check_name
 from apnpql_jax.runs import checkpoint_reader
 from apnpql_jax.training import evaluate
 from apnpql_jax.types import ARM_DOF, Array
@@ -35,7 +36,7 @@ class Decision(struct.PyTreeNode):
   """What led to the action, of a trained agent."""
 
 
-class Actor:
+class Actor(abc.ABC):
   """Base of the actors; those that do not learn have no checkpoints."""
 
   title: str
@@ -52,9 +53,9 @@ class Actor:
     """Keeps the worlds."""
     self.env = env
 
+  @abc.abstractmethod
   def decide(self, params: Any, state: EnvState, key: PRNGKeyArray) -> Decision:
     """Chooses an action per world; a pure function."""
-    raise NotImplementedError
 
   def steps(self) -> list[int]:
     """Returns the steps of the checkpoints that can be loaded now, newest first."""
@@ -66,6 +67,7 @@ class Actor:
     Raises:
       FileError: It cannot be read; the one before stays.
     """
+    raise FileError(f"{self.title} has no checkpoints")
 
 
 class Expert(Actor):

@@ -19,7 +19,7 @@ _CAMERAS, _STRIPS, _INSTANT = 190, 470, 170
 
 
 class Board:
-  """Draws the frames of an episode that goes on."""
+  """Draws the frames of an episode in progress."""
 
   def __init__(self, *, epsilon: float | None, explained: bool, scale: int = 2):
     """Prepares the sheet.

@@ -45,7 +45,7 @@ class Session:
     self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
 
   def toggle(self) -> None:
-    """Asks to pause, or to go on."""
+    """Asks to pause, or to continue."""
     self._requests.put(lambda: self._play(not self.playing))
 
   def step(self) -> None:

@@ -53,7 +53,9 @@ def opened(task: Task, *, unseen: bool) -> Iterator[OpenGL]:
   try:
     gl = OpenGL(task.scene, CONFIG, unseen=unseen)
   except ConfigError as error:
-    pytest.skip(str(error))
+    if "needs EGL or OSMesa" not in str(error):
+      raise
+    pytest.skip("no graphics library is installed")
   with gl:
     yield gl
 
