@@ -21,6 +21,10 @@ class FileError(UserError):
   """A file or folder that is damaged, foreign, locked or inaccessible."""
 
 
+class DeviceError(UserError):
+  """A device of the robot that is missing, silent, or another one than expected."""
+
+
 class RunStopped(Exception):
   """An orderly stop of a run before its last step, with a one-line reason."""
 

@@ -17,7 +17,7 @@ from apnpql_jax import runtime
 from apnpql_jax.data import demonstrations, npz
 from apnpql_jax.data.demonstrations import Demonstrations
 from apnpql_jax.errors import FileError, UserError
-from apnpql_jax.sim.physics import MAX_VELOCITY
+from apnpql_jax.sim.motors import MAX_VELOCITY
 from apnpql_jax.sim.scene import ARM_JOINTS, BASE_SITE, Scene, free_joints
 
 _CONVENTIONS: dict[str, dict[str, Any]] = {

@@ -19,7 +19,7 @@ from apnpql_jax.agents.networks import Params
 from apnpql_jax.config import codec
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.runs import leaves
-from apnpql_jax.sim import physics
+from apnpql_jax.sim import motors
 from apnpql_jax.sim.scene import ARM_JOINTS, BASE_SITE, GRIPPER_JOINT, TOOL_SITE, Scene
 from apnpql_jax.types import ACTION_DIM, Array, Observation
 
@@ -108,12 +108,12 @@ def _action(model: mujoco.MjModel, scene: Scene) -> Json:
     "meaning": "desired joint velocities, then 1 to close the gripper or 0 to open it; "
     "held for one control period",
     "units": ["rad/s"] * len(ARM_JOINTS) + ["1"],
-    "low": [-physics.MAX_VELOCITY] * len(ARM_JOINTS) + [0.0],
-    "high": [physics.MAX_VELOCITY] * len(ARM_JOINTS) + [1.0],
+    "low": [-motors.MAX_VELOCITY] * len(ARM_JOINTS) + [0.0],
+    "high": [motors.MAX_VELOCITY] * len(ARM_JOINTS) + [1.0],
     "motor_model": {
       "meaning": "joint acceleration = clip(gain (desired - present velocity))",
-      "gain_1_per_s": physics.VELOCITY_GAIN,
-      "acceleration_limit_rad_per_s2": physics.MAX_ACCELERATION,
+      "gain_1_per_s": motors.VELOCITY_GAIN,
+      "acceleration_limit_rad_per_s2": motors.MAX_ACCELERATION,
       "torque_limit_nm": torques.tolist(),
     },
   }
@@ -133,7 +133,7 @@ def _joints(model: mujoco.MjModel, scene: Scene) -> Json:
       "open_rad": ranges[-1][0],
       "closed_rad": ranges[-1][1],
       "pad_gap_m": "2 (0.0041 + 0.057 cos(q + pi / 6)), q in rad",
-      "pad_gap_speed_m_per_s": physics.GRIPPER_SPEED,
+      "pad_gap_speed_m_per_s": motors.GRIPPER_SPEED,
     },
   }
 

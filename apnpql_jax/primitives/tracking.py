@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from apnpql_jax.sim import arm
-from apnpql_jax.sim.physics import MAX_VELOCITY
+from apnpql_jax.sim.motors import MAX_VELOCITY
 from apnpql_jax.types import Array
 
 GAIN = 2.0  # 1/s, close to the target

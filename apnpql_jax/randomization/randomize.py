@@ -19,7 +19,8 @@ import numpy as np
 from apnpql_jax.config.ranges import RandomizationConfig
 from apnpql_jax.randomization import objects, visuals
 from apnpql_jax.randomization.draw import Draw, World
-from apnpql_jax.sim.physics import GRIPPER_SPEED, PhysicsState
+from apnpql_jax.sim.motors import GRIPPER_SPEED
+from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
 

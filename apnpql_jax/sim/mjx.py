@@ -8,7 +8,7 @@ import mujoco
 from mujoco import mjx
 import numpy as np
 
-from apnpql_jax.sim import physics
+from apnpql_jax.sim import motors, physics
 from apnpql_jax.sim.mjx_patches import patch_mjx
 from apnpql_jax.sim.physics import STATE_FIELDS, PhysicsState
 from apnpql_jax.sim.scene import Scene, free_joints
@@ -40,7 +40,7 @@ class MjxPhysics:
 
   def _step_world(self, state, velocity, close):
     model = self._model.replace(**physics.model_fields(state.fields))
-    speed = state.fields.get("gripper_speed", physics.GRIPPER_SPEED)
+    speed = state.fields.get("gripper_speed", motors.GRIPPER_SPEED)
     data = self._template.replace(**{k: getattr(state, k) for k in STATE_FIELDS})
 
     def substep(carry, index):
@@ -69,9 +69,9 @@ class MjxPhysics:
     data = mjx.fwd_velocity(model, mjx.fwd_position(model, data))
     mass, limit = mjx.full_m(model, data)[arm][:, arm], self._torque_limit
     bias, qvel = data.qfrc_bias[arm], data.qvel[arm]
-    torque = physics.arm_torque(mass, bias, qvel, velocity, limit)
+    torque = motors.arm_torque(mass, bias, qvel, velocity, limit)
     angle, rate = data.qpos[self.scene.gripper_qpos], data.qvel[self.scene.gripper_dof]
-    finger = physics.gripper_torque(angle, rate, close, jnp, speed=speed)
+    finger = motors.gripper_torque(angle, rate, close, jnp, speed=speed)
     data = data.replace(ctrl=jnp.append(torque, finger))
     data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
     data = mjx.solve(model, data)

@@ -16,7 +16,7 @@ import mujoco
 from mujoco import batch as mujoco_batch
 import numpy as np
 
-from apnpql_jax.sim import host_call, physics
+from apnpql_jax.sim import host_call, motors, physics
 from apnpql_jax.sim.physics import STATE_FIELDS, PhysicsState
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
@@ -84,17 +84,17 @@ class NativePhysics:
     qpos, qvel, ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
     stage = int(mujoco.mjtStage.mjSTAGE_VEL)
     batch.forward(stage=stage)
-    speed = control.get("gripper_speed", physics.GRIPPER_SPEED)
+    speed = control.get("gripper_speed", motors.GRIPPER_SPEED)
     for substep in range(self._substeps):
       now = command
       if "command" in control:
         late = np.less(substep, control["control_delay"])
         now = np.where(late[:, None], control["command"], command)
-      ctrl[:, :6] = physics.arm_torque(
+      ctrl[:, :6] = motors.arm_torque(
         mass[:, self._mass_index], bias[:, arm], qvel[:, arm], now[:, :6], limit
       )
       angle, rate = qpos[:, scene.gripper_qpos], qvel[:, scene.gripper_dof]
-      ctrl[:, 6] = physics.gripper_torque(angle, rate, now[:, 6], np, speed=speed)
+      ctrl[:, 6] = motors.gripper_torque(angle, rate, now[:, 6], np, speed=speed)
       batch.step(stage=stage)
 
 

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
 from apnpql_jax.sim.kinematics import Kinematics
-from apnpql_jax.sim.physics import FINGER_ANGLE, FINGER_LENGTH, PhysicsState
+from apnpql_jax.sim.motors import FINGER_ANGLE, FINGER_LENGTH
+from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.tasks import geometry
 from apnpql_jax.types import Array

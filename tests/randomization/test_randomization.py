@@ -17,7 +17,7 @@ from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.envs.state import EnvState
 from apnpql_jax.randomization.draw import free_bodies
 from apnpql_jax.randomization.randomize import make_randomize
-from apnpql_jax.sim import arm, engines, physics
+from apnpql_jax.sim import arm, engines, motors, physics
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.tasks import make_task, task_names
 from apnpql_jax.training.rollout import FILMED, expert_policy, make_player
@@ -126,7 +126,7 @@ def test_draws_fill_their_range_and_differ_between_worlds(task, drawn):
   ratios = {
     "mass": fields["body_mass"][:, body] / model.body_mass[body],
     "friction": fields["pair_friction"][:, 3, 0] / model.pair_friction[3, 0],
-    "gripper_speed": fields["gripper_speed"] / physics.GRIPPER_SPEED,
+    "gripper_speed": fields["gripper_speed"] / motors.GRIPPER_SPEED,
     "field_of_view": fields["cam_fovy"][:, 0] / model.cam_fovy[0],
     "color": 1 + fields["geom_rgba"][:, table, 1] - model.geom_rgba[table, 1],
     "table_height": 1 + fields["body_pos"][:, 1, 2] - model.body_pos[1, 2],

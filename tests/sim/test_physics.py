@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from apnpql_jax.errors import ConfigError
-from apnpql_jax.sim import engines, physics
+from apnpql_jax.sim import engines, motors
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.sim.mjx import MjxPhysics
 from apnpql_jax.sim.scene import load_scene
@@ -110,12 +110,12 @@ def test_velocity_and_acceleration_limits_hold(random_play, name: str):
   """Random actions stay within the limits and reach that of the acceleration."""
   resets, states = random_play
   velocity = states[name].qvel[..., :6]
-  assert np.abs(velocity).max() <= physics.MAX_VELOCITY + 0.02
+  assert np.abs(velocity).max() <= motors.MAX_VELOCITY + 0.02
   before = np.concatenate([np.asarray(resets.qvel[None, :, :6]), velocity[:-1]])
   acceleration = (velocity - before) / 0.15
-  assert np.abs(acceleration).max() <= physics.MAX_ACCELERATION * 1.05
+  assert np.abs(acceleration).max() <= motors.MAX_ACCELERATION * 1.05
   # The limit is active: random commands request more.
-  assert np.abs(acceleration).max() > physics.MAX_ACCELERATION * 0.9
+  assert np.abs(acceleration).max() > motors.MAX_ACCELERATION * 0.9
 
 
 @pytest.mark.parametrize("name", ENGINES)
@@ -126,7 +126,7 @@ def test_commanded_velocity_is_reached_up_to_the_limit(engines, resets, name: st
   state = resets
   for _ in range(8):
     state = engines[name](state, desired, jnp.ones(worlds))
-  reached = desired.at[:, 5].set(-physics.MAX_VELOCITY)
+  reached = desired.at[:, 5].set(-motors.MAX_VELOCITY)
   np.testing.assert_allclose(state.qvel[:, :6], reached, atol=5e-3)
 
 
@@ -159,7 +159,7 @@ def test_gripper_closes_at_its_speed(engines, resets, task, name: str):
     state = engines[name](state, still, close)
     gaps.append(2 * 0.057 * np.cos(state.qpos[:, scene.gripper_qpos] + np.pi / 6))
   speed = -np.diff(gaps, axis=0) / 0.15
-  np.testing.assert_allclose(speed, physics.GRIPPER_SPEED, rtol=0.12)
+  np.testing.assert_allclose(speed, motors.GRIPPER_SPEED, rtol=0.12)
   angles = np.asarray(state.qpos[:, fingers])
   np.testing.assert_allclose(angles, angles[:, :1] * np.ones(4), atol=0.02)
 

@@ -1,0 +1,1 @@
+"""The runtime of a real arm: drivers, safety limits, calibration and logs."""
