@@ -43,6 +43,14 @@ def gripper_torque(
   differently, so this is an explicit servo: from the finger's angle (rad, 0 = open) and
   velocity (rad/s) to N m, positive closes. ``speed`` is that of the pad gap, m/s.
   """
-  slope = 2 * FINGER_LENGTH * xp.sin(angle.clip(0.0, 1.1) + FINGER_ANGLE)
-  desired = (2 * close - 1) * speed / slope
+  desired = finger_rate(angle, close, xp, speed=speed)
   return (GRIPPER_GAIN * (desired - velocity)).clip(-GRIPPER_TORQUE, GRIPPER_TORQUE)
+
+
+def finger_rate(angle: Any, close: Any, xp: Any, *, speed: Any = GRIPPER_SPEED) -> Any:
+  """Computes the speed (rad/s) of the driven finger that moves the pads at ``speed``.
+
+  The arguments are those of ``gripper_torque``.
+  """
+  slope = 2 * FINGER_LENGTH * xp.sin(angle.clip(0.0, 1.1) + FINGER_ANGLE)
+  return (2 * close - 1) * speed / slope

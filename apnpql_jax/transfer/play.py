@@ -16,7 +16,7 @@ from jaxtyping import PRNGKeyArray
 import numpy as np
 
 from apnpql_jax.envs.env import Env
-from apnpql_jax.envs.state import EnvState
+from apnpql_jax.envs.state import Arrival, EnvState
 from apnpql_jax.training.diagnose import expert_stage
 from apnpql_jax.types import Array, Observation
 
@@ -26,6 +26,10 @@ the global and the wrist camera."""
 
 Act = Callable[[EnvState, Observation, PRNGKeyArray], Array]
 """(worlds, observation, key) -> actions f32[worlds, 7]."""
+
+
+Advance = Callable[[EnvState, Array, np.ndarray], Arrival]
+"""(worlds, actions f32[worlds, 7], worlds that still run) -> a control period later."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,6 +49,7 @@ def play(
   *,
   draw: Draw | None = None,
   instants: int = 0,
+  advance: Advance | None = None,
 ) -> Played:
   """Plays one episode per row of the bank; a world that breaks counts as failed.
 
@@ -55,6 +60,7 @@ def play(
     key: Key of actions and resets.
     draw: Draws the images; those of ``env``, if any, if None.
     instants: L of ``EnvState.recent``, with ``draw``.
+    advance: Runs the physics; that of ``env`` if None.
   """
   count = len(rows)
   running, success = np.ones(count, bool), np.zeros(count, bool)
@@ -77,7 +83,11 @@ def play(
         recent = _pushed(recent, seen, instants)
         seen = recent
     key, policy_key, env_key = jax.random.split(key, 3)
-    state = env.step(state, act(state, seen, policy_key), env_key)
+    action = act(state, seen, policy_key)
+    if advance is None:
+      state = env.step(state, action, env_key)
+    else:
+      state = env.observe(advance(state, action, running))
   active = np.stack(stages)
   kept = [x[x >= 0] for x in active.T]
   return Played(success, length, kept)

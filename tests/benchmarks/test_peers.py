@@ -14,10 +14,11 @@ from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config.files import load_preset
 from apnpql_jax.sim import mjx_patches
 from apnpql_jax.tasks import make_task, task_names
+from apnpql_jax.transfer import urdf
 from benchmarks.common import noise
 from benchmarks.common.mjx_patching import patched
 from benchmarks.page import reports
-from benchmarks.peers import compare, mujoco_worlds, sides, urdf, worlds
+from benchmarks.peers import compare, mujoco_worlds, sides, worlds
 from benchmarks.peers.worlds import World
 
 CAMERAS = {"global": (72, 96), "wrist": (36, 64)}
