@@ -34,14 +34,21 @@ class Transfer(OfRun):
   """Task of the expert, or the path of its file; `apnpql list` shows all."""
 
   physics: str = "native"
-  """Engine: mjx or native (C MuJoCo)."""
+  """Engine: mjx, native (C MuJoCo) or bullet (PyBullet, driven as a real arm is)."""
 
   renderer: str = "rays"
-  """What draws the images: rays (as in training) or opengl (MuJoCo's renderer)."""
+  """What draws the images: rays (as in training), opengl (MuJoCo's renderer) or tiny
+  (PyBullet's TinyRenderer)."""
 
   looks: str = "trained"
   """trained: worlds that domain randomization draws; plain: no randomization; unseen:
   textures, lights, shadows, clutter and noise that it cannot draw."""
+
+  latency_ms: Annotated[int | None, default_hint("(default: 30)")] = None
+  """With bullet: time from the virtual arm to the servos: 0, 30 or 60 ms."""
+
+  admittance: bool = False
+  """With bullet: whether the virtual arm yields to the wrench at the tool."""
 
   checkpoint: str = "newest"
   """Checkpoint: newest, best (highest success rate in training) or its step."""
@@ -66,21 +73,27 @@ def transfer(args: Transfer) -> dict[str, Any]:
   expert = args.run == EXPERT and not Path(EXPERT, "config.json").exists()
   if expert != bool(args.task):
     raise ConfigError("--task names the task of the expert; runs have their own")
+  chosen = (
+    args.physics,
+    args.renderer,
+    args.looks,
+    args.latency_ms,
+    args.admittance,
+  )
   common = {"episodes": args.episodes, "seed": args.seed}
   if expert:
     env = task_env(args.task)
 
     from apnpql_jax.transfer.transfer import Cell, transfer_expert
 
-    cell = Cell(args.physics, args.renderer, args.looks)
-    return transfer_expert(env, cell, **common)
+    return transfer_expert(env, Cell(*chosen), **common)
   run_dir = existing_run(args.run, "transfer", args.task_file)
 
   from apnpql_jax.transfer.transfer import Cell, transfer as transfer_run
 
   return transfer_run(
     run_dir,
-    Cell(args.physics, args.renderer, args.looks),
+    Cell(*chosen),
     step=checkpoint_step(args.run, args.checkpoint),
     acting=args.acting,
     **common,

@@ -101,9 +101,7 @@ class Bodies:
       pos, quat = self._base(root)
       mat = _matrix(self.client, quat)
       # PyBullet's velocity is that of the center of mass, MuJoCo's that of the frame.
-      linear, angular = map(
-        np.array, self.client.getBaseVelocity(self.place[root][0])
-      )
+      linear, angular = map(np.array, self.client.getBaseVelocity(self.place[root][0]))
       linear = linear - np.cross(angular, mat @ model.body_ipos[root])
       at, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
       qpos[at : at + 7] = [*pos, *np.roll(quat, 1)]

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import dataclasses
+import functools
 
 import mujoco
 import numpy as np
@@ -63,6 +64,7 @@ class Look:
   noise: tuple[float, float]  # standard deviations of read and shot noise
 
 
+@functools.lru_cache(maxsize=256)
 def draw(row: int, bodies: int) -> Look:
   """Draws the look of the world at a row of the reset bank."""
   rng = np.random.default_rng([VERSION, row])

@@ -7,7 +7,6 @@ field of view, and resized by area.
 from __future__ import annotations
 
 from collections.abc import Sequence
-import functools
 from typing import Any
 
 import mujoco
@@ -17,11 +16,13 @@ from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.render import Lighting
 from apnpql_jax.sim.scene import Scene, compile_file
 from apnpql_jax.transfer import looks
-from apnpql_jax.transfer.graphics import area_resized, off_screen
-
-CAMERAS = ("global", "wrist")
-OVERSAMPLING = 2
-"""Pixels that are rendered per pixel of an image, along each axis."""
+from apnpql_jax.transfer.graphics import (
+  CAMERAS,
+  OVERSAMPLING,
+  area_resized,
+  light_of,
+  off_screen,
+)
 
 SHADOW_SIZE = 512
 """Side of shadow maps in pixels."""
@@ -44,7 +45,7 @@ class OpenGL:
     self.model = model = _with_textures(scene)
     self._plain = {
       name: getattr(model, name).copy()
-      for name in ("geom_rgba", "geom_size", "geom_matid", "cam_fovy", "light_dir")
+      for name in ("geom_rgba", "geom_size", "geom_matid", "cam_fovy")
     }
     self._data = mujoco.MjData(model)
     mujoco.mj_forward(model, self._data)  # Places the lights.
@@ -102,7 +103,7 @@ class OpenGL:
     for name, value in poses.items():
       target = getattr(self._data, name)
       target[...] = value.reshape(target.shape)
-    look = _look(row, self.model.nbody) if self._unseen else None
+    look = looks.draw(row, self.model.nbody) if self._unseen else None
     background = self._dress(fields, look)
     images = []
     for index, (height, width) in enumerate(self._sizes):
@@ -141,18 +142,16 @@ class OpenGL:
     given = {**self._plain, **{k: x for k, x in fields.items() if k in self._plain}}
     for name in ("geom_rgba", "geom_size", "geom_matid", "cam_fovy"):
       getattr(model, name)[...] = given[name]
-    data.light_xdir[self._sun] = _unit(given["light_dir"][self._sun])
-    lighting = Lighting()
-    ambient = fields.get("light_ambient", [[lighting.ambient]])[self._sun][0]
-    diffuse = fields.get("light_diffuse", [[lighting.diffuse]])[self._sun][0]
+    light = light_of(model, fields)
+    data.light_xdir[self._sun] = light.direction
     model.vis.headlight.diffuse[:] = model.vis.headlight.specular[:] = 0
-    model.vis.headlight.ambient[:] = look.ambient if look else ambient
+    model.vis.headlight.ambient[:] = look.ambient if look else light.ambient
     model.light_ambient[:] = 0
     model.light_specular[:] = look.specular if look else 0
-    model.light_diffuse[self._sun] = look.sun_rgb if look else diffuse
+    model.light_diffuse[self._sun] = look.sun_rgb if look else light.diffuse
     model.light_active[self._lamp] = look is not None
     if look is None:
-      return fields.get("background", lighting.background)
+      return light.background
     data.light_xdir[self._sun] = _unit(look.sun_dir)
     data.light_xpos[self._lamp] = look.lamp_pos
     data.light_xdir[self._lamp] = _unit(np.array([0.5, 0.0, 0.0]) - look.lamp_pos)
@@ -179,11 +178,6 @@ class OpenGL:
     rgba = np.append(rgb, 1.0).astype(np.float32)
     mujoco.mjv_initGeom(geom, shape, size, pos, mat, rgba)
     self._scene.ngeom += 1
-
-
-@functools.lru_cache(maxsize=256)
-def _look(row: int, bodies: int) -> looks.Look:
-  return looks.draw(row, bodies)
 
 
 def _with_textures(scene: Scene) -> mujoco.MjModel:

@@ -237,9 +237,7 @@ class VirtualArm:
     return self.angles.copy(), self.rates.copy()
 
 
-def with_fields(
-  model: mujoco.MjModel, fields: dict[str, np.ndarray]
-) -> mujoco.MjModel:
+def with_fields(model: mujoco.MjModel, fields: dict[str, np.ndarray]) -> mujoco.MjModel:
   """Returns a copy of the model with the fields of one world."""
   model = copy.copy(model)
   for name, value in fields.items():

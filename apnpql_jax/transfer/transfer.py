@@ -31,12 +31,16 @@ from apnpql_jax.training.diagnose import end_of
 from apnpql_jax.training.evaluate import check_count, held_out_batches, load_agent
 from apnpql_jax.transfer import looks
 from apnpql_jax.transfer.opengl import OpenGL
+from apnpql_jax.transfer.plant import Worlds
 from apnpql_jax.transfer.play import Act, Draw, Played, play
+from apnpql_jax.transfer.tiny import Tiny
 from apnpql_jax.types import Array
 
-PHYSICS = ("mjx", "native")
-RENDERERS = ("rays", "opengl")
+PHYSICS = ("mjx", "native", "bullet")
+RENDERERS = ("rays", "opengl", "tiny")
 LOOKS = ("trained", "plain", "unseen")
+LATENCIES_MS = (0, 30, 60)
+LATENCY_MS = 30
 
 EXPERT_SUFFICES = 0.95
 """Success rate of the expert from which on a cell tells something about a policy."""
@@ -58,13 +62,55 @@ class Cell:
   """trained: worlds that domain randomization draws, within the ranges of the run,
   physics included; plain: those of the scene file; unseen: see ``looks``."""
 
+  latency_ms: int | None = None
+  """Time from the virtual arm to the servos, one of ``LATENCIES_MS``; 30 if None.
+  Only with Bullet, as the next one."""
+
+  admittance: bool = False
+  """Whether the virtual arm yields to the wrench at the tool."""
+
   def check(self) -> None:
     """Raises ``ConfigError`` if there is no such cell."""
     check_name("--physics", self.physics, PHYSICS)
     check_name("--renderer", self.renderer, RENDERERS)
     check_name("--looks", self.looks, LOOKS)
     if self.looks == "unseen" and self.renderer == "rays":
-      raise ConfigError("--looks unseen needs --renderer opengl")
+      raise ConfigError("--looks unseen needs --renderer opengl or tiny")
+    if self.physics != "bullet":
+      if self.latency_ms is not None or self.admittance:
+        option = "--admittance" if self.latency_ms is None else "--latency-ms"
+        raise ConfigError(f"{option} needs --physics bullet")
+    elif self.latency_ms not in (None, *LATENCIES_MS):
+      choices = ", ".join(map(str, LATENCIES_MS))
+      raise ConfigError(f"--latency-ms {self.latency_ms} must be one of {choices}")
+
+  def about(self) -> dict[str, Any]:
+    """Returns what the result says about the cell."""
+    about = {k: getattr(self, k) for k in ("physics", "renderer", "looks")}
+    if self.physics == "bullet":
+      about |= {"latency_ms": self._latency_ms, "admittance": self.admittance}
+    if self.looks == "unseen":
+      about["looks_version"] = looks.VERSION
+    return about
+
+  @property
+  def _latency_ms(self) -> int:
+    return LATENCY_MS if self.latency_ms is None else self.latency_ms
+
+  def worlds(self, env: Env) -> Worlds | None:
+    """Returns Bullet's worlds; None if the environment has the physics itself."""
+    if self.physics != "bullet":
+      return None
+    latency_s = self._latency_ms / 1000
+    return Worlds(env, latency_s=latency_s, admittance=self.admittance)
+
+  def renderer_of(self, env: Env) -> OpenGL | Tiny | None:
+    """Returns what draws the images; None if the environment does itself."""
+    draws = {"opengl": OpenGL, "tiny": Tiny}
+    if self.renderer not in draws:
+      return None
+    unseen = self.looks == "unseen"
+    return draws[self.renderer](env.task.scene, env.config, unseen=unseen)
 
 
 def transfer(
@@ -113,14 +159,11 @@ def transfer(
     return choose(params, seen, key)
 
   with contextlib.ExitStack() as stack:
-    draw = None
-    if outside:
-      unseen = cell.looks == "unseen"
-      gl = stack.enter_context(OpenGL(env.task.scene, config.env, unseen=unseen))
-      draw = make_draw(env, gl)
-    played = _play_all(
-      env, act, episodes, seed, draw=draw, instants=instants if outside else 0
-    )
+    if outside := cell.renderer_of(env):
+      draw = make_draw(env, stack.enter_context(outside))
+    else:
+      draw, instants = None, 0
+    played = _play_all(env, cell, act, episodes, seed, draw=draw, instants=instants)
   about = {"checkpoint_step": step, "acting": acting, "trained": _training(config)}
   return _summary(config.env.task, cell, about, played, began)
 
@@ -142,12 +185,12 @@ def transfer_expert(
     del seen, key
     return choose(state)
 
-  played = _play_all(env, act, episodes, seed)
+  played = _play_all(env, cell, act, episodes, seed)
   found = _summary(env_config.task, cell, {"algorithm": "expert"}, played, began)
   return found | {"sufficient": found["success_rate"] >= EXPERT_SUFFICES}
 
 
-def make_draw(env: Env, gl: OpenGL) -> Draw:
+def make_draw(env: Env, renderer: OpenGL | Tiny) -> Draw:
   """Returns a function that draws all running worlds; others stay black."""
   poses_of = make_kinematics(env.task.scene)
   sizes = env.config.global_size, env.config.wrist_size
@@ -160,7 +203,7 @@ def make_draw(env: Env, gl: OpenGL) -> Draw:
     fields = {name: np.asarray(x) for name, x in state.physics.fields.items()}
     images = [np.zeros((len(rows), *size, 3), np.uint8) for size in sizes]
     for world in np.flatnonzero(running):
-      views = gl.draw(
+      views = renderer.draw(
         {name: x[world] for name, x in poses.items()},
         {name: x[world] for name, x in fields.items()},
         int(rows[world]),
@@ -176,19 +219,24 @@ def make_draw(env: Env, gl: OpenGL) -> Draw:
 
 def _make_env(config: EnvConfig, cell: Cell, obs: str, *, instants: int) -> Env:
   devices.start()
+  # With Bullet, the environment only starts and observes the worlds.
+  backend = "native" if cell.physics == "bullet" else cell.physics
   config = dataclasses.replace(
-    config, backend=cell.physics, randomize=cell.looks == "trained", obs=obs
+    config, backend=backend, randomize=cell.looks == "trained", obs=obs
   )
   return make_env(config, instants=instants)
 
 
 def _play_all(
-  env: Env, act: Act, episodes: int, seed: int, **options: Any
+  env: Env, cell: Cell, act: Act, episodes: int, seed: int, **options: Any
 ) -> list[Played]:
-  return [
-    play(env, act, rows, key, **options)
-    for rows, key in held_out_batches(env, episodes=episodes, seed=seed)
-  ]
+  with contextlib.ExitStack() as stack:
+    if worlds := cell.worlds(env):
+      options["advance"] = stack.enter_context(worlds).advance
+    return [
+      play(env, act, rows, key, **options)
+      for rows, key in held_out_batches(env, episodes=episodes, seed=seed)
+    ]
 
 
 def _training(config: TrainConfig) -> str:
@@ -207,8 +255,7 @@ def _summary(
   )
   return {
     "task": task,
-    **dataclasses.asdict(cell),
-    **({"looks_version": looks.VERSION} if cell.looks == "unseen" else {}),
+    **cell.about(),
     **about,
     "episodes": episodes,
     "successes": solved,

@@ -1,0 +1,275 @@
+"""PyBullet's TinyRenderer behind the two cameras of the agent.
+
+It draws on the CPU, without a graphics library. Every geom is a body of its own, at the
+poses of MuJoCo's kinematics, so that it draws worlds of any physics. One light shines,
+and surfaces have no checkers or waves. Images are rendered larger and resized by area,
+as those of ``opengl``.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from pathlib import Path
+import tempfile
+from typing import Any
+
+import imageio.v3 as iio
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from apnpql_jax.config.schema import EnvConfig
+from apnpql_jax.errors import ConfigError
+from apnpql_jax.render import Geoms
+from apnpql_jax.sim.scene import Scene
+from apnpql_jax.transfer import looks
+from apnpql_jax.transfer.bullet import connect
+from apnpql_jax.transfer.graphics import (
+  CAMERAS,
+  OVERSAMPLING,
+  area_resized,
+  given,
+  light_of,
+)
+
+KEPT = 64
+"""Worlds that stay loaded."""
+
+_NEAR, _FAR = 0.01, 10.0  # m
+_TABLE = 4.0  # m, half the side of the square that stands for a plane
+_REPEAT = 3  # textures of the table per meter, as in ``opengl``
+_LIGHT_M = 3.0  # m, where the light stands for its shadows
+_RINGS = 16  # of an ellipsoid
+
+
+class Tiny:
+  """Draws worlds one after the other."""
+
+  def __init__(self, scene: Scene, config: EnvConfig, *, unseen: bool):
+    """Prepares the textures; ``unseen`` uses them.
+
+    Raises:
+      ConfigError: PyBullet is not installed, or the scene has meshes.
+    """
+    sizes = config.global_size, config.wrist_size
+    self._sizes = [(OVERSAMPLING * h, OVERSAMPLING * w) for h, w in sizes]
+    self._model, self._geoms = scene.model, Geoms.from_model(scene.model)
+    if (self._geoms.types == mujoco.mjtGeom.mjGEOM_MESH).any():
+      raise ConfigError(f"{scene.name}.xml has meshes, which --renderer tiny lacks")
+    self._cameras = [scene.id("camera", name) for name in CAMERAS]
+    self._unseen, self._shadows = unseen, unseen or config.shadows
+    self._worlds: OrderedDict[Any, _World] = OrderedDict()
+    self._textures = tempfile.TemporaryDirectory()
+    self._world_of(scene.model.geom_size, None, None).client.disconnect()
+    self._worlds.clear()
+
+  def __enter__(self) -> Tiny:
+    return self
+
+  def __exit__(self, *error: object) -> None:
+    """Frees the simulators and the files of textures."""
+    for world in self._worlds.values():
+      world.client.disconnect()
+    self._textures.cleanup()
+
+  def draw(
+    self,
+    poses: dict[str, np.ndarray],
+    fields: dict[str, np.ndarray],
+    row: int,
+    time: int,
+  ) -> list[np.ndarray]:
+    """Returns the images u8[H, W, 3] of the global and the wrist camera.
+
+    The arguments are those of ``OpenGL.draw``.
+    """
+    look = looks.draw(row, self._model.nbody) if self._unseen else None
+    sizes = given(self._model, fields, "geom_size")
+    world = self._world_of(sizes, row, look)
+    world.place(poses["geom_xpos"], poses["geom_xmat"])
+    if look is None:
+      world.color(given(self._model, fields, "geom_rgba"))
+    light = light_of(self._model, fields)
+    lighting = {
+      "lightDirection": (-light.direction).tolist(),
+      "lightColor": [1.0, 1.0, 1.0],
+      "lightAmbientCoeff": light.ambient,
+      "lightDiffuseCoeff": light.diffuse,
+      "lightSpecularCoeff": 0.0,
+    }
+    background = light.background
+    if look:
+      brightness = float(look.sun_rgb.max())
+      background = look.backdrop
+      lighting = {
+        "lightDirection": (-look.sun_dir).tolist(),
+        "lightColor": (look.sun_rgb / brightness).tolist(),
+        "lightAmbientCoeff": look.ambient,
+        "lightDiffuseCoeff": brightness,
+        "lightSpecularCoeff": look.specular,
+      }
+    lighting |= {"lightDistance": _LIGHT_M, "shadow": int(self._shadows)}
+    angles, images = given(self._model, fields, "cam_fovy"), []
+    for index, camera in enumerate(self._cameras):
+      eye, mat = (poses[name][camera] for name in ("cam_xpos", "cam_xmat"))
+      image = world.image(
+        self._sizes[index], eye, np.reshape(mat, (3, 3)), angles[camera], lighting
+      )
+      image = np.where(image[..., 3:] > 0, image[..., :3], _bytes(background))
+      image = area_resized(image.astype(np.uint8), OVERSAMPLING)
+      if look:
+        rng = np.random.default_rng([looks.VERSION, row, time, index])
+        image = looks.photograph(image, look, index, rng)
+      images.append(image)
+    return images
+
+  def _world_of(
+    self, sizes: np.ndarray, row: int | None, look: looks.Look | None
+  ) -> _World:
+    """Returns the simulator with the shapes of a world."""
+    key = row if look else None, sizes.tobytes()
+    if key not in self._worlds:
+      if len(self._worlds) >= KEPT:
+        self._worlds.popitem(last=False)[1].client.disconnect()
+      folder = Path(self._textures.name)
+      self._worlds[key] = _World(self._model, self._geoms, sizes, look, folder)
+    self._worlds.move_to_end(key)
+    return self._worlds[key]
+
+
+class _World:
+  """A simulator that holds the visible geoms of a world, each as a body."""
+
+  def __init__(
+    self,
+    model: mujoco.MjModel,
+    geoms: Geoms,
+    sizes: np.ndarray,
+    look: looks.Look | None,
+    folder: Path,
+  ):
+    self.client = connect("--renderer tiny")
+    self._folder, self._ids, self._colors = folder, geoms.ids, {}
+    self._files: dict[str, int] = {}
+    self._bodies = []
+    for geom, kind, rgb in zip(geoms.ids, geoms.types, geoms.colors, strict=True):
+      texture = None
+      if look and kind == mujoco.mjtGeom.mjGEOM_PLANE:
+        rgb, texture = look.table_rgb, ("table", look.table)
+      elif look:
+        texture = "surface", int(look.surfaces[model.geom_bodyid[geom]])
+      self._bodies.append(self._add(int(kind), sizes[geom], rgb, texture))
+    for thing in look.clutter if look else ():
+      body = self._add(thing.shape, thing.size, thing.rgb, ("surface", thing.surface))
+      self._put(body, thing.pos, thing.mat)
+
+  def place(self, pos: np.ndarray, mat: np.ndarray) -> None:
+    """Moves the geoms to poses by MuJoCo's ids."""
+    for body, geom in zip(self._bodies, self._ids, strict=True):
+      self._put(body, pos[geom], mat[geom])
+
+  def color(self, rgba: np.ndarray) -> None:
+    """Changes the colors of geoms, by MuJoCo's ids."""
+    for body, geom in zip(self._bodies, self._ids, strict=True):
+      color = (*rgba[geom, :3].tolist(), 1.0)
+      if self._colors.get(body) != color:
+        self.client.changeVisualShape(body, -1, rgbaColor=color)
+        self._colors[body] = color
+
+  def image(
+    self,
+    size: tuple[int, int],
+    eye: np.ndarray,
+    mat: np.ndarray,
+    fovy: float,
+    lighting: dict[str, Any],
+  ) -> np.ndarray:
+    """Returns RGB and whether something is there, u8[H, W, 4]."""
+    client, (height, width) = self.client, size
+    ahead, up = eye - mat[:, 2], mat[:, 1]
+    lens = (float(fovy), width / height, _NEAR, _FAR)
+    *_, picture, _, segments = client.getCameraImage(
+      width,
+      height,
+      client.computeViewMatrix(eye.tolist(), ahead.tolist(), up.tolist()),
+      client.computeProjectionMatrixFOV(*lens),
+      renderer=client.ER_TINY_RENDERER,
+      **lighting,
+    )
+    image = np.reshape(np.asarray(picture, np.uint8), (height, width, 4)).copy()
+    image[..., 3] = np.reshape(segments, (height, width)) >= 0
+    return image
+
+  def _add(
+    self, kind: int, size: np.ndarray, rgb: Any, texture: tuple[str, int] | None
+  ) -> int:
+    client, rgba = self.client, [*np.asarray(rgb, float).tolist(), 1.0]
+    shape = client.createVisualShape(rgbaColor=rgba, **_shape(client, kind, size))
+    body = client.createMultiBody(0, -1, shape)
+    if texture:
+      number = self._texture(*texture)
+      client.changeVisualShape(body, -1, textureUniqueId=number)
+    return body
+
+  def _texture(self, kind: str, index: int) -> int:
+    name = f"{kind}_{index}.png"
+    if name not in self._files:
+      path = self._folder / name
+      if not path.exists():
+        image = getattr(looks, f"{kind}_texture")(index)
+        iio.imwrite(path, image[: looks.SIDE])  # One face of a cube.
+      self._files[name] = self.client.loadTexture(str(path))
+    return self._files[name]
+
+  def _put(self, body: int, pos: np.ndarray, mat: np.ndarray) -> None:
+    quat = Rotation.from_matrix(np.reshape(mat, (3, 3))).as_quat()
+    self.client.resetBasePositionAndOrientation(body, pos.tolist(), quat.tolist())
+
+
+def _shape(client: Any, kind: int, size: np.ndarray) -> dict[str, Any]:
+  """Returns the arguments of PyBullet's shape for one of MuJoCo's."""
+  kinds, radius = mujoco.mjtGeom, float(size[0])
+  if kind == kinds.mjGEOM_BOX:
+    return {"shapeType": client.GEOM_BOX, "halfExtents": size.tolist()}
+  if kind == kinds.mjGEOM_SPHERE:
+    return {"shapeType": client.GEOM_SPHERE, "radius": radius}
+  if kind in (kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER):
+    name = mujoco.mjtGeom(kind).name.removeprefix("mj")
+    length = 2.0 * float(size[1])
+    return {"shapeType": getattr(client, name), "radius": radius, "length": length}
+  if kind == kinds.mjGEOM_PLANE:
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    mesh = _TABLE * corners, [0, 1, 2, 0, 2, 3], _REPEAT * _TABLE * corners[:, :2]
+    normals = np.tile([0.0, 0.0, 1.0], (4, 1))
+  else:
+    points, faces, uvs = _sphere()
+    mesh, normals = (points * size, faces, uvs), points / size
+  vertices, indices, uvs = mesh
+  return {
+    "shapeType": client.GEOM_MESH,
+    "vertices": np.asarray(vertices, float).tolist(),
+    "indices": list(indices),
+    "uvs": np.asarray(uvs, float).tolist(),
+    "normals": normals.tolist(),
+  }
+
+
+def _sphere() -> tuple[np.ndarray, list[int], np.ndarray]:
+  """Returns points, triangles and texture coordinates of a unit sphere."""
+  across, down = np.meshgrid(
+    np.linspace(0, 1, 2 * _RINGS + 1), np.linspace(0, 1, _RINGS)
+  )
+  turn, tilt = 2 * np.pi * across, np.pi * down
+  points = np.stack(
+    [np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)], -1
+  )
+  faces, columns = [], across.shape[1]
+  for row in range(_RINGS - 1):
+    for column in range(columns - 1):
+      a = row * columns + column
+      faces += [a, a + columns, a + 1, a + 1, a + columns, a + columns + 1]
+  return points.reshape(-1, 3), faces, np.stack([across, down], -1).reshape(-1, 2)
+
+
+def _bytes(rgb: Any) -> np.ndarray:
+  return (255 * np.asarray(rgb, float).clip(0, 1) + 0.5).astype(np.uint8)
