@@ -8,8 +8,13 @@ from typing import Annotated, Any
 
 import tyro
 
-from apnpql_jax.cli.commands import checkpoint_step, existing_run, task_env
-from apnpql_jax.cli.options import OfRun, default_hint
+from apnpql_jax.cli.commands import (
+  check_free,
+  checkpoint_step,
+  existing_run,
+  task_env,
+)
+from apnpql_jax.cli.options import File, Flag, OfRun, default_hint
 from apnpql_jax.errors import ConfigError
 
 EXPERT = "expert"
@@ -62,6 +67,13 @@ class Transfer(OfRun):
   seed: int = 0
   """Random seed of the episodes and of the policy."""
 
+  video: File = None
+  """Also write a video of the first success and the first failure to this .mp4 or .gif
+  file."""
+
+  overwrite: Flag = False
+  """Replace the video if it exists."""
+
 
 def transfer(args: Transfer) -> dict[str, Any]:
   """Plays the episodes of one cell and returns their figures."""
@@ -80,16 +92,23 @@ def transfer(args: Transfer) -> dict[str, Any]:
     args.latency_ms,
     args.admittance,
   )
-  common = {"episodes": args.episodes, "seed": args.seed}
+  check_free(args.video, overwrite=args.overwrite)
+  common: dict[str, Any] = {
+    "episodes": args.episodes,
+    "seed": args.seed,
+    "video": args.video,
+  }
   if expert:
     env = task_env(args.task)
 
-    from apnpql_jax.transfer.transfer import Cell, transfer_expert
+    from apnpql_jax.transfer.cell import Cell
+    from apnpql_jax.transfer.transfer import transfer_expert
 
     return transfer_expert(env, Cell(*chosen), **common)
   run_dir = existing_run(args.run, "transfer", args.task_file)
 
-  from apnpql_jax.transfer.transfer import Cell, transfer as transfer_run
+  from apnpql_jax.transfer.cell import Cell
+  from apnpql_jax.transfer.transfer import transfer as transfer_run
 
   return transfer_run(
     run_dir,

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 import contextlib
 import ctypes
+import importlib
 import os
 from pathlib import Path
 import sys
@@ -18,40 +19,43 @@ from apnpql_jax.errors import ConfigError
 from apnpql_jax.transfer import urdf
 
 
-def connect(option: str) -> Any:
-  """Returns a client of a PyBullet simulator of its own, without a window.
-
-  Args:
-    option: What needs PyBullet, for the message.
-
-  Raises:
-    ConfigError: PyBullet is not installed.
-  """
+def require(option: str) -> None:
+  """Raises ``ConfigError`` if PyBullet, which an option needs, is not installed."""
   with _quiet():
     try:
-      import pybullet
-      from pybullet_utils.bullet_client import BulletClient
+      importlib.import_module("pybullet")
     except ImportError:
       raise ConfigError(
         f"{option} needs PyBullet: pip install 'apnpql-jax[transfer]'"
       ) from None
+
+
+def connect() -> Any:
+  """Returns a client of a PyBullet simulator of its own, without a window."""
+  with _quiet():
+    import pybullet
+    from pybullet_utils.bullet_client import BulletClient
+
     return BulletClient(connection_mode=pybullet.DIRECT)
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def _quiet() -> Generator[None]:
   """Drops what PyBullet's C code prints; standard output may be JSON."""
   flush = ctypes.CDLL(None).fflush
   sys.stdout.flush()
+  sys.stderr.flush()
   flush(None)
-  kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
-  os.dup2(nowhere, 1)
+  kept, nowhere = [os.dup(1), os.dup(2)], os.open(os.devnull, os.O_WRONLY)
+  for stream in (1, 2):
+    os.dup2(nowhere, stream)
   try:
     yield
   finally:
     flush(None)
-    os.dup2(kept, 1)
-    os.close(kept)
+    for stream, copy in zip((1, 2), kept, strict=True):
+      os.dup2(copy, stream)
+      os.close(copy)
     os.close(nowhere)
 
 

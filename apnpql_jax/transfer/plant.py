@@ -1,10 +1,9 @@
 """PyBullet as a plant: one world that is driven as a real arm is.
 
-A virtual arm integrates the motor model of training. Its joint positions are the
-commands of Bullet's position servos, as servoJ's are on the real arm, so that neither
-the armature that Bullet lacks nor its velocity motors matter. Commands arrive late, and
-joints have Coulomb friction. The finger that the motor drives moves the other three
-through gears.
+The virtual arm of the robot's runtime moves as in training, and Bullet's position
+servos follow it, as those of the real arm do. So neither the armature that Bullet lacks
+nor its velocity motors matter. Commands arrive late, and joints have Coulomb friction.
+The finger with the motor moves the other three through gears.
 """
 
 from __future__ import annotations
@@ -13,24 +12,19 @@ from collections import deque
 import copy
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from apnpql_jax.envs.env import Env
-from apnpql_jax.envs.state import Arrival, EnvState
+from apnpql_jax.robot.arm_model import FLANGE, ArmModel
+from apnpql_jax.robot.limits import TIMESTEP
+from apnpql_jax.robot.virtual_arm import Admittance, VirtualArm
 from apnpql_jax.sim import motors
 from apnpql_jax.sim.physics import OWN_FIELDS
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.transfer import bullet, contacts
-from apnpql_jax.types import Array
-
-COMMAND_S = 0.002
-"""Time between commands of the servos, as of servoJ, s."""
 
 SUBSTEPS = 2
-"""Steps of Bullet per command."""
+"""Steps of Bullet per command, which come every 2 ms, as to the real arm."""
 
 ITERATIONS = 100
 """Iterations of Bullet's solver."""
@@ -52,17 +46,18 @@ class Plant:
   """One world; ``begin`` starts an episode."""
 
   def __init__(self, scene: Scene, *, latency_s: float, admittance: bool):
-    """Opens a simulator.
-
-    Raises:
-      ConfigError: PyBullet is not installed.
-    """
+    """Opens a simulator."""
     self.scene = scene
-    self._client = bullet.connect("--physics bullet")
-    self._delay = round(latency_s / COMMAND_S)
-    self._admittance = admittance
+    self._client = bullet.connect()
+    self._delay = round(latency_s / TIMESTEP)
+    self._virtual = VirtualArm(
+      ArmModel(), admittance=Admittance() if admittance else None
+    )
 
-  def close(self) -> None:
+  def __enter__(self) -> Plant:
+    return self
+
+  def __exit__(self, *error: object) -> None:
     """Frees the simulator."""
     self._client.disconnect()
 
@@ -76,49 +71,72 @@ class Plant:
     client.resetSimulation()
     client.setGravity(*model.opt.gravity)
     client.setPhysicsEngineParameter(
-      fixedTimeStep=COMMAND_S, numSubSteps=SUBSTEPS, numSolverIterations=ITERATIONS
+      fixedTimeStep=TIMESTEP, numSubSteps=SUBSTEPS, numSolverIterations=ITERATIONS
     )
     self.bodies = bodies = bullet.Bodies(client, model)
     bodies.reset(qpos, mocap_pos, mocap_quat)
     arm, finger = model.actuator_trnid[:6, 0], int(model.actuator_trnid[6, 0])
     self._arm = [bodies.joints[int(joint)] for joint in arm]
     self._limit = model.actuator_ctrlrange[:, 1]
+    self._flange_body = int(model.site(FLANGE).bodyid[0])
+    self._hand = {
+      link for body, (_, link) in bodies.place.items() if body > self._flange_body
+    }
     self._finger = bodies.joints[finger]
     self._touch(model)
     others = [link for j, link in bodies.joints.items() if j > finger]
     self._couple(others)
     self._still([*self._arm, *others])
     angles = np.asarray(qpos, float)[scene.arm_qpos]
-    self._virtual = VirtualArm(angles)
-    self._sent = deque([(angles, np.zeros(6))] * (self._delay + 1), self._delay + 1)
-    self._last = None
+    self._virtual.reset(angles)
+    # The command before the present one gives its speed.
+    self._sent = deque([angles] * (self._delay + 2), self._delay + 2)
+    self._measured = angles
+    self._last = np.zeros(6), float(qpos[scene.gripper_qpos] > 0.5)
 
   def step(self, velocity: np.ndarray, close: float, period_s: float) -> None:
     """Runs a control period with desired joint velocities f64[6], rad/s."""
     late = float(self._fields.get("control_delay", 0.0)) * self.scene.model.opt.timestep
     now = (np.asarray(velocity, float), float(close))
-    for command in range(round(period_s / COMMAND_S)):
-      early = self._last is not None and command * COMMAND_S < late
-      self._drive(*(self._last if early else now))
+    for command in range(round(period_s / TIMESTEP)):
+      self._drive(*(self._last if command * TIMESTEP < late else now))
       self._client.stepSimulation()
+      states = self._client.getJointStates(self.bodies.robot, self._arm)
+      self._measured = np.array([state[0] for state in states])
     self._last = now
 
+  def wrench(self) -> np.ndarray:
+    """Returns the contact wrench on the hand, f64[6], see ``protocols.ArmState``."""
+    pos, mat = self.bodies.pose(self._flange_body)
+    flange = pos + mat @ self.bodies.model.site(FLANGE).pos
+    force, torque = np.zeros(3), np.zeros(3)
+    for contact in self._client.getContactPoints(self.bodies.robot):
+      if contact[3] not in self._hand:
+        continue
+      pushes = [contact[9] * np.array(contact[7])]
+      pushes += [contact[k] * np.array(contact[k + 1]) for k in (10, 12)]
+      force += sum(pushes)
+      torque += np.cross(np.array(contact[5]) - flange, sum(pushes))
+    base = self._virtual.model.base_mat
+    return np.concatenate([base.T @ force, base.T @ torque])
+
   def _drive(self, velocity: np.ndarray, close: float) -> None:
-    """Sends the commands of ``COMMAND_S``."""
+    """Sends the commands of one cycle of 2 ms."""
     client, robot = self._client, self.bodies.robot
-    self._sent.append(self._virtual.step(velocity, COMMAND_S))
-    angles, rates = self._sent[0]
+    wrench = self.wrench() if self._virtual.admittance else None
+    self._sent.append(self._virtual.step(velocity, self._measured, wrench))
+    before, angles = self._sent[0], self._sent[1]
+    *joints, finger = client.getJointStates(robot, [*self._arm, self._finger])
     client.setJointMotorControlArray(
       robot,
       self._arm,
       client.POSITION_CONTROL,
       targetPositions=angles.tolist(),
-      targetVelocities=rates.tolist(),
+      targetVelocities=((angles - before) / TIMESTEP).tolist(),
       positionGains=[SERVO_GAIN] * 6,
       velocityGains=[1.0] * 6,
       forces=self._limit[:6].tolist(),
     )
-    *joints, finger = client.getJointStates(robot, [*self._arm, self._finger])
     moving = np.tanh(np.array([joint[1] for joint in joints]) / FRICTION_SPEED)
     client.setJointMotorControlArray(
       robot,
@@ -177,64 +195,6 @@ class Plant:
       self._client.setJointMotorControl2(
         self.bodies.robot, link, self._client.VELOCITY_CONTROL, force=0
       )
-
-
-class Worlds:
-  """A plant per world, for the loop of ``play``."""
-
-  def __init__(self, env: Env, *, latency_s: float, admittance: bool):
-    """Keeps the settings; plants are built when episodes begin."""
-    self._env, self._plants = env, []
-    self._options = {"latency_s": latency_s, "admittance": admittance}
-
-  def __enter__(self) -> Worlds:
-    return self
-
-  def __exit__(self, *error: object) -> None:
-    """Frees the simulators."""
-    for plant in self._plants:
-      plant.close()
-
-  def advance(self, state: EnvState, action: Array, running: np.ndarray) -> Arrival:
-    """Runs a control period of the running worlds; the others stand still.
-
-    It takes the place of ``Env.advance``, without resets. Plants carry the state of
-    servos and solver, so that they follow the worlds from their first instant on.
-    """
-    physics: Any = jax.tree.map(np.array, state.physics)
-    action, elapsed = np.asarray(action), np.asarray(state.elapsed)
-    while len(self._plants) < len(running):
-      self._plants.append(Plant(self._env.task.scene, **self._options))
-    for world in np.flatnonzero(running):
-      plant = self._plants[world]
-      if not elapsed[world]:
-        fields = {name: x[world] for name, x in physics.fields.items()}
-        poses = (x[world] for x in (physics.mocap_pos, physics.mocap_quat))
-        plant.begin(physics.qpos[world], *poses, fields)
-      period = self._env.config.control_period_s
-      plant.step(action[world, :6], action[world, 6], period)
-      physics.qpos[world], physics.qvel[world] = plant.bodies.state()
-      physics.time[world] += period
-    broken = ~np.isfinite(np.concatenate([physics.qpos, physics.qvel], 1)).all(1)
-    moved = jax.tree.map(jnp.asarray, physics)
-    arrival = Arrival.after(state, moved, state.targets, jnp.zeros(len(running), bool))
-    return arrival.replace(faults=state.faults + broken)
-
-
-class VirtualArm:
-  """Stand-in."""
-
-  def __init__(self, angles: np.ndarray):
-    self.angles, self.rates = angles.copy(), np.zeros(6)
-
-  def step(self, velocity: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    desired = velocity.clip(-motors.MAX_VELOCITY, motors.MAX_VELOCITY)
-    acceleration = (motors.VELOCITY_GAIN * (desired - self.rates)).clip(
-      -motors.MAX_ACCELERATION, motors.MAX_ACCELERATION
-    )
-    self.rates = self.rates + dt * acceleration
-    self.angles = self.angles + dt * self.rates
-    return self.angles.copy(), self.rates.copy()
 
 
 def with_fields(model: mujoco.MjModel, fields: dict[str, np.ndarray]) -> mujoco.MjModel:

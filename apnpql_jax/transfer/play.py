@@ -17,11 +17,14 @@ import numpy as np
 
 from apnpql_jax.envs.env import Env
 from apnpql_jax.envs.state import Arrival, EnvState
+from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.training.diagnose import expert_stage
 from apnpql_jax.types import Array, Observation
 
-Draw = Callable[[EnvState, np.ndarray, np.ndarray, int], tuple[Array, Array]]
-"""(worlds, bank rows, worlds that still run, instant) -> images u8[worlds, H, W, 3] of
+Draw = Callable[
+  [PhysicsState, np.ndarray, np.ndarray, int | np.ndarray], tuple[Array, Array]
+]
+"""(worlds, bank rows, worlds that still run, instants) -> images u8[worlds, H, W, 3] of
 the global and the wrist camera."""
 
 Act = Callable[[EnvState, Observation, PRNGKeyArray], Array]
@@ -39,6 +42,11 @@ class Played:
   success: np.ndarray  # bool[worlds]
   length: np.ndarray  # i32[worlds], control periods
   stages: list[np.ndarray]  # i32[length] each: stage at every instant but the last
+  rows: np.ndarray  # i32[worlds] of the bank
+  start: PhysicsState
+  """The worlds at the first instant."""
+  qpos: np.ndarray
+  """Their configurations at every instant, f32[time, worlds, nq]."""
 
 
 def play(
@@ -66,18 +74,20 @@ def play(
   running, success = np.ones(count, bool), np.zeros(count, bool)
   length, stages = np.zeros(count, np.int32), []
   watch = jax.jit(lambda state: expert_stage(env, state))
-  state, recent = env.reset(rows), None
+  state, recent, qpos = env.reset(rows), None, []
+  start = state.physics
   for time in range(env.config.episode_steps + 1):
     running = running & (np.asarray(state.faults) == 0)
     success |= running & np.asarray(state.timestep.terminated)
     length = np.where(running, np.asarray(state.elapsed), length)
     running = running & ~np.asarray(state.timestep.last)
+    qpos.append(np.asarray(state.physics.qpos))
     stages.append(np.where(running, np.asarray(watch(state)), -1))
     if not running.any():
       break
     seen = state.observation
     if draw is not None:
-      images = draw(state, np.asarray(rows), running, time)
+      images = draw(state.physics, np.asarray(rows), running, time)
       seen = with_images(state.timestep.observation, images)
       if instants:
         recent = _pushed(recent, seen, instants)
@@ -90,7 +100,7 @@ def play(
       state = env.observe(advance(state, action, running))
   active = np.stack(stages)
   kept = [x[x >= 0] for x in active.T]
-  return Played(success, length, kept)
+  return Played(success, length, kept, np.asarray(rows), start, np.stack(qpos))
 
 
 def with_images(observation: Observation, images: tuple[Array, Array]) -> Observation:

@@ -49,7 +49,7 @@ class Tiny:
     """Prepares the textures; ``unseen`` uses them.
 
     Raises:
-      ConfigError: PyBullet is not installed, or the scene has meshes.
+      ConfigError: The scene has meshes.
     """
     sizes = config.global_size, config.wrist_size
     self._sizes = [(OVERSAMPLING * h, OVERSAMPLING * w) for h, w in sizes]
@@ -60,8 +60,6 @@ class Tiny:
     self._unseen, self._shadows = unseen, unseen or config.shadows
     self._worlds: OrderedDict[Any, _World] = OrderedDict()
     self._textures = tempfile.TemporaryDirectory()
-    self._world_of(scene.model.geom_size, None, None).client.disconnect()
-    self._worlds.clear()
 
   def __enter__(self) -> Tiny:
     return self
@@ -148,7 +146,7 @@ class _World:
     look: looks.Look | None,
     folder: Path,
   ):
-    self.client = connect("--renderer tiny")
+    self.client = connect()
     self._folder, self._ids, self._colors = folder, geoms.ids, {}
     self._files: dict[str, int] = {}
     self._bodies = []

@@ -21,96 +21,30 @@ import numpy as np
 from apnpql_jax import devices
 from apnpql_jax.config.checks import ACTING
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
+from apnpql_jax.console import reporting
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.envs.state import EnvState
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs import checkpoint_reader, run_folder
 from apnpql_jax.runs.metrics import wilson_interval
 from apnpql_jax.sim.kinematics import make_kinematics
+from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.training.diagnose import end_of
-from apnpql_jax.training.evaluate import check_count, held_out_batches, load_agent
-from apnpql_jax.transfer import looks
-from apnpql_jax.transfer.opengl import OpenGL
-from apnpql_jax.transfer.plant import Worlds
+from apnpql_jax.training.evaluate import (
+  check_count,
+  check_video,
+  held_out_batches,
+  load_agent,
+)
+from apnpql_jax.transfer import film
+from apnpql_jax.transfer.cell import Cell, Renderer
 from apnpql_jax.transfer.play import Act, Draw, Played, play
-from apnpql_jax.transfer.tiny import Tiny
 from apnpql_jax.types import Array
-
-PHYSICS = ("mjx", "native", "bullet")
-RENDERERS = ("rays", "opengl", "tiny")
-LOOKS = ("trained", "plain", "unseen")
-LATENCIES_MS = (0, 30, 60)
-LATENCY_MS = 30
 
 EXPERT_SUFFICES = 0.95
 """Success rate of the expert from which on a cell tells something about a policy."""
 
 _POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat")
-
-
-@dataclasses.dataclass(frozen=True)
-class Cell:
-  """What the worlds of a test consist of."""
-
-  physics: str = "native"
-  """Engine, one of ``PHYSICS``."""
-
-  renderer: str = "rays"
-  """What draws the images, one of ``RENDERERS``."""
-
-  looks: str = "trained"
-  """trained: worlds that domain randomization draws, within the ranges of the run,
-  physics included; plain: those of the scene file; unseen: see ``looks``."""
-
-  latency_ms: int | None = None
-  """Time from the virtual arm to the servos, one of ``LATENCIES_MS``; 30 if None.
-  Only with Bullet, as the next one."""
-
-  admittance: bool = False
-  """Whether the virtual arm yields to the wrench at the tool."""
-
-  def check(self) -> None:
-    """Raises ``ConfigError`` if there is no such cell."""
-    check_name("--physics", self.physics, PHYSICS)
-    check_name("--renderer", self.renderer, RENDERERS)
-    check_name("--looks", self.looks, LOOKS)
-    if self.looks == "unseen" and self.renderer == "rays":
-      raise ConfigError("--looks unseen needs --renderer opengl or tiny")
-    if self.physics != "bullet":
-      if self.latency_ms is not None or self.admittance:
-        option = "--admittance" if self.latency_ms is None else "--latency-ms"
-        raise ConfigError(f"{option} needs --physics bullet")
-    elif self.latency_ms not in (None, *LATENCIES_MS):
-      choices = ", ".join(map(str, LATENCIES_MS))
-      raise ConfigError(f"--latency-ms {self.latency_ms} must be one of {choices}")
-
-  def about(self) -> dict[str, Any]:
-    """Returns what the result says about the cell."""
-    about = {k: getattr(self, k) for k in ("physics", "renderer", "looks")}
-    if self.physics == "bullet":
-      about |= {"latency_ms": self._latency_ms, "admittance": self.admittance}
-    if self.looks == "unseen":
-      about["looks_version"] = looks.VERSION
-    return about
-
-  @property
-  def _latency_ms(self) -> int:
-    return LATENCY_MS if self.latency_ms is None else self.latency_ms
-
-  def worlds(self, env: Env) -> Worlds | None:
-    """Returns Bullet's worlds; None if the environment has the physics itself."""
-    if self.physics != "bullet":
-      return None
-    latency_s = self._latency_ms / 1000
-    return Worlds(env, latency_s=latency_s, admittance=self.admittance)
-
-  def renderer_of(self, env: Env) -> OpenGL | Tiny | None:
-    """Returns what draws the images; None if the environment does itself."""
-    draws = {"opengl": OpenGL, "tiny": Tiny}
-    if self.renderer not in draws:
-      return None
-    unseen = self.looks == "unseen"
-    return draws[self.renderer](env.task.scene, env.config, unseen=unseen)
 
 
 def transfer(
@@ -121,10 +55,12 @@ def transfer(
   seed: int = 0,
   step: int | None = None,
   acting: str | None = None,
+  video: Path | str | None = None,
 ) -> dict[str, Any]:
   """Plays held-out episodes of a cell with a checkpoint of a run.
 
-  ``step`` and ``acting`` are as in ``evaluate``.
+  ``step`` and ``acting`` are as in ``evaluate``. ``video`` is the file for a video of
+  the first success and the first failure.
 
   Returns:
     Success rate with its Wilson interval, and failures by their last stage, as in
@@ -134,7 +70,7 @@ def transfer(
     ConfigError: An argument is invalid, or a package or library is missing.
     FileError: Not a run folder, or no readable checkpoint.
   """
-  began = time.monotonic()
+  began, video = time.monotonic(), None if video is None else check_video(video)
   cell.check()
   check_count(episodes, seed)
   if acting is not None:
@@ -159,23 +95,28 @@ def transfer(
     return choose(params, seen, key)
 
   with contextlib.ExitStack() as stack:
-    if outside := cell.renderer_of(env):
-      draw = make_draw(env, stack.enter_context(outside))
-    else:
-      draw, instants = None, 0
+    draw = _draw_of(env, cell, stack)
+    instants = instants if draw else 0
     played = _play_all(env, cell, act, episodes, seed, draw=draw, instants=instants)
+    filmed = _filmed(env, played, video, draw)
   about = {"checkpoint_step": step, "acting": acting, "trained": _training(config)}
-  return _summary(config.env.task, cell, about, played, began)
+  return _summary(config.env.task, cell, about, played, began) | filmed
 
 
 def transfer_expert(
-  env_config: EnvConfig, cell: Cell, *, episodes: int = 200, seed: int = 0
+  env_config: EnvConfig,
+  cell: Cell,
+  *,
+  episodes: int = 200,
+  seed: int = 0,
+  video: Path | str | None = None,
 ) -> dict[str, Any]:
   """Plays held-out episodes of a cell with the scripted expert; see ``transfer``.
 
-  The expert sees no images. ``sufficient`` is whether it reaches ``EXPERT_SUFFICES``.
+  The expert sees no images; a video shows those of the cell. ``sufficient`` is whether
+  it reaches ``EXPERT_SUFFICES``.
   """
-  began = time.monotonic()
+  began, video = time.monotonic(), None if video is None else check_video(video)
   cell.check()
   check_count(episodes, seed)
   env = _make_env(env_config, cell, "state", instants=0)
@@ -186,28 +127,34 @@ def transfer_expert(
     return choose(state)
 
   played = _play_all(env, cell, act, episodes, seed)
+  with contextlib.ExitStack() as stack:
+    draw = _draw_of(env, cell, stack) if video else None
+    filmed = _filmed(env, played, video, draw)
   found = _summary(env_config.task, cell, {"algorithm": "expert"}, played, began)
-  return found | {"sufficient": found["success_rate"] >= EXPERT_SUFFICES}
+  return found | filmed | {"sufficient": found["success_rate"] >= EXPERT_SUFFICES}
 
 
-def make_draw(env: Env, renderer: OpenGL | Tiny) -> Draw:
+def make_draw(env: Env, renderer: Renderer) -> Draw:
   """Returns a function that draws all running worlds; others stay black."""
   poses_of = make_kinematics(env.task.scene)
   sizes = env.config.global_size, env.config.wrist_size
 
   def draw(
-    state: EnvState, rows: np.ndarray, running: np.ndarray, instant: int
+    state: PhysicsState,
+    rows: np.ndarray,
+    running: np.ndarray,
+    instants: int | np.ndarray,
   ) -> tuple[Array, Array]:
-    kinematics = poses_of(state.physics)
+    kinematics, instants = poses_of(state), np.broadcast_to(instants, len(rows))
     poses = {name: np.asarray(getattr(kinematics, name)) for name in _POSES}
-    fields = {name: np.asarray(x) for name, x in state.physics.fields.items()}
+    fields = {name: np.asarray(x) for name, x in state.fields.items()}
     images = [np.zeros((len(rows), *size, 3), np.uint8) for size in sizes]
     for world in np.flatnonzero(running):
       views = renderer.draw(
         {name: x[world] for name, x in poses.items()},
         {name: x[world] for name, x in fields.items()},
         int(rows[world]),
-        instant,
+        int(instants[world]),
       )
       for image, view in zip(images, views, strict=True):
         image[world] = view
@@ -215,6 +162,24 @@ def make_draw(env: Env, renderer: OpenGL | Tiny) -> Draw:
     return overview, wrist
 
   return draw
+
+
+def _draw_of(env: Env, cell: Cell, stack: contextlib.ExitStack) -> Draw | None:
+  """Returns what draws the images; None if the environment does itself."""
+  outside = cell.renderer_of(env)
+  return make_draw(env, stack.enter_context(outside)) if outside else None
+
+
+def _filmed(
+  env: Env, played: list[Played], video: Path | None, draw: Draw | None
+) -> dict[str, Any]:
+  """Writes the video, if asked for; returns what the result says about it."""
+  if video is None:
+    return {}
+  found: dict[str, Any] = {"video": None}
+  with reporting(f"write {video}"):  # The episodes took minutes; keep their figures.
+    found = film.record(env, played, video, draw=draw)
+  return found
 
 
 def _make_env(config: EnvConfig, cell: Cell, obs: str, *, instants: int) -> Env:

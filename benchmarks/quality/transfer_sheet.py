@@ -50,7 +50,7 @@ def sheet(config: EnvConfig) -> list[np.ndarray]:
       rows.append(joined(seen.global_image, seen.wrist_image))
     for unseen in (False,) if randomize else (False, True):
       with OpenGL(env.task.scene, config, unseen=unseen) as gl:
-        images = make_draw(env, gl)(state, ROWS, np.ones(WORLDS, bool), PERIODS)
+        images = make_draw(env, gl)(state.physics, ROWS, np.ones(WORLDS, bool), PERIODS)
         rows.append(joined(*images))
   return [*rows[:2], rows[3], rows[2]]
 

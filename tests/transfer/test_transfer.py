@@ -23,10 +23,11 @@ from apnpql_jax.tasks import Task
 from apnpql_jax.training.rollout import expert_policy, make_player
 from apnpql_jax.training.train import train
 from apnpql_jax.transfer import looks
+from apnpql_jax.transfer.cell import Cell
 from apnpql_jax.transfer.graphics import area_resized
 from apnpql_jax.transfer.opengl import OpenGL
 from apnpql_jax.transfer.play import play
-from apnpql_jax.transfer.transfer import Cell, make_draw, transfer, transfer_expert
+from apnpql_jax.transfer.transfer import make_draw, transfer, transfer_expert
 
 CONFIG = dataclasses.replace(testing.TINY.env, task="push_plate")
 
@@ -71,7 +72,7 @@ def state(env: Env) -> EnvState:
 
 def images(gl: OpenGL, env: Env, state: EnvState, time: int = 0) -> list[np.ndarray]:
   """Returns the images of the worlds."""
-  views = make_draw(env, gl)(state, ROWS, np.ones(len(ROWS), bool), time)
+  views = make_draw(env, gl)(state.physics, ROWS, np.ones(len(ROWS), bool), time)
   return [np.asarray(view) for view in views]
 
 
@@ -131,7 +132,7 @@ def test_clutter_stays_out_of_the_workspace():
 
 def test_worlds_that_are_over_are_not_drawn(plain, env, state):
   running = np.array([True, False, True])
-  views = make_draw(env, plain)(state, ROWS, running, 0)
+  views = make_draw(env, plain)(state.physics, ROWS, running, 0)
   assert all(np.asarray(x[0]).any() and not np.asarray(x[1]).any() for x in views)
 
 

@@ -1,0 +1,92 @@
+"""A cell of the table of transfer: physics, renderer and looks."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from apnpql_jax.envs.env import Env
+from apnpql_jax.errors import ConfigError, check_name
+from apnpql_jax.transfer import bullet, looks
+from apnpql_jax.transfer.opengl import OpenGL
+from apnpql_jax.transfer.tiny import Tiny
+from apnpql_jax.transfer.worlds import Worlds
+
+Renderer = OpenGL | Tiny
+"""Draws images outside of JAX."""
+
+PHYSICS = ("mjx", "native", "bullet")
+RENDERERS = ("rays", "opengl", "tiny")
+LOOKS = ("trained", "plain", "unseen")
+
+LATENCIES_MS = (0, 30, 60)
+LATENCY_MS = 30
+"""About that of the real arm's servos."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+  """What the worlds of a test consist of."""
+
+  physics: str = "native"
+  """Engine, one of ``PHYSICS``."""
+
+  renderer: str = "rays"
+  """What draws the images, one of ``RENDERERS``."""
+
+  looks: str = "trained"
+  """trained: worlds that domain randomization draws, within the ranges of the run,
+  physics included; plain: those of the scene file; unseen: see ``looks``."""
+
+  latency_ms: int | None = None
+  """Time from the virtual arm to the servos, one of ``LATENCIES_MS``; 30 if None.
+  Only with Bullet, as the next one."""
+
+  admittance: bool = False
+  """Whether the virtual arm yields to the wrench at the tool."""
+
+  def check(self) -> None:
+    """Raises ``ConfigError`` if there is no such cell, or a package is missing."""
+    check_name("--physics", self.physics, PHYSICS)
+    check_name("--renderer", self.renderer, RENDERERS)
+    check_name("--looks", self.looks, LOOKS)
+    if self.looks == "unseen" and self.renderer == "rays":
+      raise ConfigError("--looks unseen needs --renderer opengl or tiny")
+    if self.physics != "bullet":
+      if self.latency_ms is not None or self.admittance:
+        option = "--admittance" if self.latency_ms is None else "--latency-ms"
+        raise ConfigError(f"{option} needs --physics bullet")
+    elif self.latency_ms not in (None, *LATENCIES_MS):
+      choices = ", ".join(map(str, LATENCIES_MS))
+      raise ConfigError(f"--latency-ms {self.latency_ms} must be one of {choices}")
+    for option, value in (("--physics", "bullet"), ("--renderer", "tiny")):
+      if value in (self.physics, self.renderer):
+        bullet.require(f"{option} {value}")
+
+  def about(self) -> dict[str, Any]:
+    """Returns what the result says about the cell."""
+    about = {k: getattr(self, k) for k in ("physics", "renderer", "looks")}
+    if self.physics == "bullet":
+      about |= {"latency_ms": self._latency_ms, "admittance": self.admittance}
+    if self.looks == "unseen":
+      about["looks_version"] = looks.VERSION
+    return about
+
+  @property
+  def _latency_ms(self) -> int:
+    return LATENCY_MS if self.latency_ms is None else self.latency_ms
+
+  def worlds(self, env: Env) -> Worlds | None:
+    """Returns Bullet's worlds; None if the environment has the physics itself."""
+    if self.physics != "bullet":
+      return None
+    latency_s = self._latency_ms / 1000
+    return Worlds(env, latency_s=latency_s, admittance=self.admittance)
+
+  def renderer_of(self, env: Env) -> OpenGL | Tiny | None:
+    """Returns what draws the images; None if the environment does itself."""
+    draws = {"opengl": OpenGL, "tiny": Tiny}
+    if self.renderer not in draws:
+      return None
+    unseen = self.looks == "unseen"
+    return draws[self.renderer](env.task.scene, env.config, unseen=unseen)

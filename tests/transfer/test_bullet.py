@@ -1,0 +1,265 @@
+"""PyBullet as a plant: the bodies of MuJoCo, moved as a real arm is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import sys
+
+import mujoco
+import numpy as np
+import pytest
+
+from apnpql_jax.errors import ConfigError
+from apnpql_jax.robot.limits import TIMESTEP
+from apnpql_jax.robot.virtual_arm import VirtualArm
+from apnpql_jax.sim import motors
+from apnpql_jax.sim.scene import Scene
+from apnpql_jax.tasks import make_task, task_names
+from apnpql_jax.tasks.pinch import finger_angle, pinch_height
+from apnpql_jax.tasks.stack_box import SIDE
+from apnpql_jax.transfer import bullet, contacts
+from apnpql_jax.transfer.cell import Cell
+from apnpql_jax.transfer.plant import Plant, with_fields
+
+PERIOD_S = 0.15
+FIRST = np.array([0.4, -0.3, 0.3, 0.2, -0.3, 0.4])
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+  return make_task("stack_box").scene
+
+
+@pytest.fixture(scope="module")
+def plant(scene: Scene) -> Iterator[Plant]:
+  pytest.importorskip("pybullet")
+  with Plant(scene, latency_s=0.0, admittance=False) as plant:
+    yield plant
+
+
+def begin(plant: Plant, *, closed: bool = False, **fields: np.ndarray) -> np.ndarray:
+  """Starts from the keyframe; returns its qpos."""
+  model = plant.scene.model
+  qpos, data = plant.scene.keyframe("neutral"), mujoco.MjData(model)
+  if closed:
+    qpos[plant.scene.gripper_qpos : plant.scene.gripper_qpos + 4] = 1.1
+  plant.begin(qpos, data.mocap_pos, data.mocap_quat, fields)
+  return qpos
+
+
+@pytest.mark.parametrize("name", task_names())
+def test_bodies_have_the_masses_and_inertias_of_the_model(name):
+  pytest.importorskip("pybullet")
+  model = make_task(name).scene.model
+  client = bullet.connect()
+  bodies = bullet.Bodies(client, model)
+  for body in range(1, model.nbody):
+    if model.body_mocapid[body] >= 0:
+      continue
+    dynamics = client.getDynamicsInfo(*bodies.place[body])
+    fixed = body == model.body("base").id  # PyBullet's base is fixed.
+    assert dynamics[0] == (0 if fixed else pytest.approx(model.body_mass[body]))
+    if not fixed:
+      np.testing.assert_allclose(dynamics[2], model.body_inertia[body], rtol=1e-4)
+  client.disconnect()
+
+
+@pytest.mark.parametrize("name", task_names())
+def test_state_is_that_of_mujoco_and_kinematics_agree(name):
+  pytest.importorskip("pybullet")
+  model = make_task(name).scene.model
+  data, client = mujoco.MjData(model), bullet.connect()
+  bodies, rng = bullet.Bodies(client, model), np.random.default_rng(0)
+  for _ in range(5):
+    for joint, at in enumerate(model.jnt_qposadr):
+      if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
+        quat = rng.normal(size=4)
+        quat *= np.sign(quat[0]) / np.linalg.norm(quat)
+        data.qpos[at : at + 7] = [*rng.uniform(-0.3, 0.3, 3), *quat]
+      else:
+        data.qpos[at] = rng.uniform(*model.jnt_range[joint])
+    mujoco.mj_kinematics(model, data)
+    bodies.reset(data.qpos, data.mocap_pos, data.mocap_quat)
+    qpos, qvel = bodies.state()
+    for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+      at = model.jnt_qposadr[joint]
+      qpos[at + 3 : at + 7] *= np.sign(qpos[at + 3])
+    np.testing.assert_allclose(qpos, data.qpos, atol=1e-6)
+    np.testing.assert_array_equal(qvel, 0)
+    for body in range(model.nbody):
+      pos, mat = bodies.pose(body)
+      np.testing.assert_allclose(pos, data.xpos[body], atol=1e-4)
+      np.testing.assert_allclose(mat.ravel(), data.xmat[body], atol=1e-4)
+  client.disconnect()
+
+
+def test_velocity_of_an_object_is_that_of_its_frame():
+  """The center of mass of this plate lies 3 mm above its frame."""
+  pytest.importorskip("pybullet")
+  model = make_task("push_plate").scene.model
+  data, client = mujoco.MjData(model), bullet.connect()
+  bodies, plate = bullet.Bodies(client, model), model.body("plate").id
+  client.setPhysicsEngineParameter(fixedTimeStep=1e-3)
+  data.qpos[:] = model.key("neutral").qpos
+  data.qpos[-7:] = [0.5, 0.0, 1.0, *np.array([0.8, 0.2, 0.4, 0.4])]
+  bodies.reset(data.qpos, data.mocap_pos, data.mocap_quat)
+  client.resetBaseVelocity(bodies.place[plate][0], [0.1, 0.2, 0.3], [2.0, -1.0, 3.0])
+  before, velocity = bodies.state()
+  client.stepSimulation()
+  change = np.zeros(model.nv)
+  mujoco.mj_differentiatePos(model, change, 1e-3, before, bodies.state()[0])
+  np.testing.assert_allclose(velocity[-6:], change[-6:], atol=0.01)
+  client.disconnect()
+
+
+def test_arm_follows_the_virtual_arm(plant):
+  qpos, virtual = begin(plant), VirtualArm()
+  virtual.reset(qpos[plant.scene.arm_qpos])
+  for velocity in (FIRST, -FIRST, FIRST):
+    plant.step(velocity, 0.0, PERIOD_S)
+    for _ in range(round(PERIOD_S / TIMESTEP)):
+      virtual.step(velocity)
+    found, rate = plant.bodies.state()
+    np.testing.assert_allclose(found[:6], virtual.position, atol=2e-3)
+    np.testing.assert_allclose(rate[:6], virtual.velocity, atol=2e-2)
+
+
+@pytest.mark.parametrize("latency_s", [0.03, 0.06])
+def test_latency_shifts_the_motion(latency_s, scene, plant):
+  begin(plant)
+  path = follow(plant)
+  shift = round(latency_s / TIMESTEP)
+  with Plant(scene, latency_s=latency_s, admittance=False) as late:
+    begin(late)
+    found = follow(late)
+  np.testing.assert_allclose(found[shift:], path[:-shift], atol=1e-3)
+  assert np.abs(found[shift:] - path[shift:]).max() > 5e-3
+
+
+def follow(plant: Plant) -> np.ndarray:
+  """Returns joint angles f64[time, 6] at every cycle of two periods."""
+  path = []
+  for _ in range(round(2 * PERIOD_S / TIMESTEP)):
+    plant.step(FIRST, 0.0, TIMESTEP)
+    path.append(plant.bodies.state()[0][:6])
+  return np.array(path)
+
+
+def test_delayed_commands_start_late(plant):
+  """``control_delay`` counts steps of MuJoCo, 5 ms each."""
+  begin(plant, control_delay=np.float32(4))
+  plant.step(FIRST, 0.0, 0.018)
+  still = plant.bodies.state()[0][:6]
+  np.testing.assert_allclose(still, plant.scene.keyframe("neutral")[:6], atol=1e-4)
+
+
+def test_fingers_move_together_at_the_speed_of_the_motor(plant):
+  qpos = begin(plant)
+  seen = []
+  for close in (1.0, 0.0):
+    for _ in range(12):
+      plant.step(np.zeros(6), close, PERIOD_S)
+      fingers = plant.bodies.state()[0][6:10]
+      np.testing.assert_allclose(fingers, fingers[0], atol=0.01)
+      seen.append(fingers[0])
+  assert qpos[6] == 0 and seen[11] == pytest.approx(1.1, abs=0.01)
+  assert seen[-1] == pytest.approx(0.0, abs=0.01)
+  gap = [2 * motors.FINGER_LENGTH * np.cos(q + motors.FINGER_ANGLE) for q in seen[:4]]
+  np.testing.assert_allclose(-np.diff(gap) / PERIOD_S, motors.GRIPPER_SPEED, rtol=0.05)
+
+
+def test_pads_hold_a_box_that_the_arm_lifts(plant):
+  qpos = begin(plant)
+  model, data = plant.scene.model, mujoco.MjData(plant.scene.model)
+  qpos[6:10] = finger_angle(SIDE)
+  data.qpos[:] = qpos
+  mujoco.mj_kinematics(model, data)
+  at, _ = plant.scene.free_joint("yellow")
+  tool = data.site("tool")
+  quat = np.zeros(4)
+  mujoco.mju_mat2Quat(quat, tool.xmat)
+  pads = tool.xpos - float(pinch_height(SIDE)) * tool.xmat.reshape(3, 3)[:, 2]
+  qpos[at : at + 7] = [*pads, *quat]
+  plant.begin(qpos, data.mocap_pos, data.mocap_quat, {})
+  plant.step(np.zeros(6), 1.0, PERIOD_S)
+  for _ in range(6):
+    plant.step(np.array([0.2, -0.2, 0, 0, 0, 0]), 1.0, PERIOD_S)
+  data.qpos[:], _ = plant.bodies.state()
+  mujoco.mj_kinematics(model, data)
+  moved = tool.xpos - float(pinch_height(SIDE)) * tool.xmat.reshape(3, 3)[:, 2]
+  assert np.linalg.norm(moved - pads) > 0.03
+  np.testing.assert_allclose(data.qpos[at : at + 3], moved, atol=3e-3)
+
+
+def test_admittance_yields_to_the_table(scene):
+  """The hand moves down onto it."""
+  pytest.importorskip("pybullet")
+  reached = {}
+  for admittance in (False, True):
+    with Plant(scene, latency_s=0.0, admittance=admittance) as plant:
+      begin(plant, closed=True)
+      forces = []
+      for _ in range(20):
+        plant.step(np.array([0, 0.25, 0, -0.25, 0, 0]), 1.0, PERIOD_S)
+        forces.append(np.linalg.norm(plant.wrench()[:3]))
+    reached[admittance] = max(forces)
+  assert reached[True] > 5.0  # N; it touches.
+  assert reached[True] < 0.5 * reached[False]
+
+
+def test_nothing_pushes_a_hand_in_the_air(plant):
+  begin(plant, closed=True)
+  plant.step(np.zeros(6), 1.0, PERIOD_S)
+  np.testing.assert_array_equal(plant.wrench(), 0)
+
+
+def test_frictions_of_the_pairs_become_factors():
+  model = make_task("push_plate").scene.model
+  factors = contacts.sliding(model)
+  plate, tip = model.body("plate").id, model.body("r2").id
+  assert factors[0] * factors[plate] == pytest.approx(0.2)
+  assert factors[tip] * factors[plate] == pytest.approx(0.3)
+  assert contacts.spinning(model) == {}
+  model = make_task("place_plate").scene.model
+  tip = model.body("r2").id
+  assert contacts.spinning(model)[tip] == pytest.approx(0.01)
+
+
+def test_worlds_have_fields_of_their_own(scene):
+  mass = scene.model.body_mass.astype(np.float32) * 2
+  model = with_fields(scene.model, {"body_mass": mass, "gripper_speed": np.float32(1)})
+  np.testing.assert_array_equal(model.body_mass, mass)
+  assert scene.model.body_mass[1] != mass[1]
+
+
+@pytest.mark.parametrize(
+  ("cell", "words"),
+  [
+    (Cell(latency_ms=30), "--latency-ms needs --physics bullet"),
+    (Cell(admittance=True), "--admittance needs --physics bullet"),
+    (Cell("bullet", latency_ms=31), "--latency-ms 31 must be one of 0, 30, 60"),
+  ],
+)
+def test_options_of_bullet_are_checked(cell, words):
+  with pytest.raises(ConfigError, match=words):
+    cell.check()
+
+
+@pytest.mark.parametrize(
+  ("cell", "option"),
+  [
+    (Cell("bullet"), "--physics bullet"),
+    (Cell(renderer="tiny"), "--renderer tiny"),
+  ],
+)
+def test_a_missing_package_is_named(cell, option, monkeypatch):
+  monkeypatch.setitem(sys.modules, "pybullet", None)
+  cure = f"{option} needs PyBullet: pip install 'apnpql-jax\\[transfer\\]'"
+  with pytest.raises(ConfigError, match=cure):
+    cell.check()
+
+
+def test_pybullet_prints_nothing(capfd):
+  pytest.importorskip("pybullet")
+  bullet.connect().disconnect()
+  assert capfd.readouterr() == ("", "")
