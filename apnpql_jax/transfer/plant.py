@@ -23,14 +23,14 @@ from apnpql_jax.sim.physics import OWN_FIELDS
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.transfer import bullet, contacts
 
-SUBSTEPS = 2
-"""Steps of Bullet per command, which come every 2 ms, as to the real arm."""
+ITERATIONS = 300
+"""Iterations of Bullet's solver, which makes a step of 2 ms per command of the servos.
 
-ITERATIONS = 100
-"""Iterations of Bullet's solver."""
+With 100, a cup creeps between the pads and slowly pushes the hand open.
+"""
 
 SERVO_GAIN = 0.1
-"""Share of the position error that a servo removes in a step of Bullet."""
+"""Share of the position error that a servo removes in a step."""
 
 FRICTION = 0.03
 """Coulomb friction of a joint as a share of its largest torque."""
@@ -40,6 +40,16 @@ FRICTION_SPEED = 0.01
 
 GEAR_FORCE = 100.0
 """Largest torque of a gear between fingers, N m."""
+
+
+FINGER_INERTIA = 0.1
+"""Share of the fingers' armature that their links get.
+
+With none, the solver is far from converged in a grip, and the gears give way.
+"""
+
+GEAR_ERP = 0.2
+"""Share of a gear's error that Bullet removes in a step."""
 
 
 class Plant:
@@ -71,7 +81,7 @@ class Plant:
     client.resetSimulation()
     client.setGravity(*model.opt.gravity)
     client.setPhysicsEngineParameter(
-      fixedTimeStep=TIMESTEP, numSubSteps=SUBSTEPS, numSolverIterations=ITERATIONS
+      fixedTimeStep=TIMESTEP, numSolverIterations=ITERATIONS
     )
     self.bodies = bodies = bullet.Bodies(client, model)
     bodies.reset(qpos, mocap_pos, mocap_quat)
@@ -84,6 +94,7 @@ class Plant:
     }
     self._finger = bodies.joints[finger]
     self._touch(model)
+    self._burden(model)
     others = [link for j, link in bodies.joints.items() if j > finger]
     self._couple(others)
     self._still([*self._arm, *others])
@@ -110,13 +121,15 @@ class Plant:
     pos, mat = self.bodies.pose(self._flange_body)
     flange = pos + mat @ self.bodies.model.site(FLANGE).pos
     force, torque = np.zeros(3), np.zeros(3)
-    for contact in self._client.getContactPoints(self.bodies.robot):
-      if contact[3] not in self._hand:
-        continue
-      pushes = [contact[9] * np.array(contact[7])]
-      pushes += [contact[k] * np.array(contact[k + 1]) for k in (10, 12)]
-      force += sum(pushes)
-      torque += np.cross(np.array(contact[5]) - flange, sum(pushes))
+    # Of all pairs: asked for one body, PyBullet does not turn the friction with a pair.
+    for contact in self._client.getContactPoints():
+      sides = (contact[1], contact[3]), (contact[2], contact[4])
+      for (body, link), sign in zip(sides, (1, -1), strict=True):
+        if body == self.bodies.robot and link in self._hand:
+          push = contact[9] * np.array(contact[7])
+          push += sum(contact[k] * np.array(contact[k + 1]) for k in (10, 12))
+          force += sign * push
+          torque += np.cross(np.array(contact[5]) - flange, sign * push)
     base = self._virtual.model.base_mat
     return np.concatenate([base.T @ force, base.T @ torque])
 
@@ -174,6 +187,23 @@ class Plant:
         jointDamping=float(model.dof_damping[dof]) if hinge else 0.0,
       )
 
+  def _burden(self, model: mujoco.MjModel) -> None:
+    """Adds a share of the fingers' armature, which Bullet lacks, to their links."""
+    for joint, link in self.bodies.joints.items():
+      body = int(model.jnt_bodyid[joint])
+      if link not in self._hand:
+        continue
+      mat = np.zeros(9)
+      mujoco.mju_quat2Mat(mat, model.body_iquat[body])
+      # The principal axis that the joint turns about.
+      axis = np.abs(mat.reshape(3, 3).T @ model.jnt_axis[joint]).round()
+      extra = FINGER_INERTIA * model.dof_armature[model.jnt_dofadr[joint]] * axis
+      self._client.changeDynamics(
+        self.bodies.robot,
+        link,
+        localInertiaDiagonal=(model.body_inertia[body] + extra).tolist(),
+      )
+
   def _couple(self, others: list[int]) -> None:
     """Lets the driven finger move the others."""
     for link in others:
@@ -187,7 +217,9 @@ class Plant:
         [0, 0, 0],
         [0, 0, 0],
       )
-      self._client.changeConstraint(gear, gearRatio=-1, maxForce=GEAR_FORCE, erp=0.2)
+      self._client.changeConstraint(
+        gear, gearRatio=-1, maxForce=GEAR_FORCE, erp=GEAR_ERP
+      )
 
   def _still(self, links: list[int]) -> None:
     """Takes out the brakes that PyBullet puts into every joint."""

@@ -151,12 +151,12 @@ class _World:
     self._files: dict[str, int] = {}
     self._bodies = []
     for geom, kind, rgb in zip(geoms.ids, geoms.types, geoms.colors, strict=True):
-      texture = None
+      kind, texture = int(kind), None
       if look and kind == mujoco.mjtGeom.mjGEOM_PLANE:
         rgb, texture = look.table_rgb, ("table", look.table)
       elif look:
         texture = "surface", int(look.surfaces[model.geom_bodyid[geom]])
-      self._bodies.append(self._add(int(kind), sizes[geom], rgb, texture))
+      self._bodies.append(self._add(kind, sizes[geom], rgb, texture))
     for thing in look.clutter if look else ():
       body = self._add(thing.shape, thing.size, thing.rgb, ("surface", thing.surface))
       self._put(body, thing.pos, thing.mat)

@@ -192,19 +192,23 @@ def test_pads_hold_a_box_that_the_arm_lifts(plant):
 
 
 def test_admittance_yields_to_the_table(scene):
-  """The hand moves down onto it."""
+  """The hand moves down onto it and slides away from the base."""
   pytest.importorskip("pybullet")
-  reached = {}
+  down, forces = np.array([0, 0.25, 0, -0.25, 0, 0]), {}
   for admittance in (False, True):
     with Plant(scene, latency_s=0.0, admittance=admittance) as plant:
       begin(plant, closed=True)
-      forces = []
-      for _ in range(20):
-        plant.step(np.array([0, 0.25, 0, -0.25, 0, 0]), 1.0, PERIOD_S)
-        forces.append(np.linalg.norm(plant.wrench()[:3]))
-    reached[admittance] = max(forces)
-  assert reached[True] > 5.0  # N; it touches.
-  assert reached[True] < 0.5 * reached[False]
+      for _ in range(17):
+        plant.step(down, 1.0, PERIOD_S)
+      felt = []
+      for _ in range(round(3 * PERIOD_S / TIMESTEP)):
+        plant.step(down, 1.0, TIMESTEP)
+        felt.append(plant.wrench()[:3])
+      forces[admittance] = np.mean(felt, axis=0)
+  assert forces[False][2] > 50.0  # N, upward
+  assert 0.0 < forces[True][2] < 0.5 * forces[False][2]
+  # The base's y is the world's x.
+  assert forces[False][1] < -10.0
 
 
 def test_nothing_pushes_a_hand_in_the_air(plant):
