@@ -37,7 +37,7 @@ KEPT = 64
 
 _NEAR, _FAR = 0.01, 10.0  # m
 _TABLE = 4.0  # m, half the side of the square that stands for a plane
-_REPEAT = 3  # textures of the table per meter, as in ``opengl``
+_REPEAT = 1.5  # textures of the table per meter, about as in ``opengl``
 _LIGHT_M = 3.0  # m, where the light stands for its shadows
 _RINGS = 16  # of an ellipsoid
 

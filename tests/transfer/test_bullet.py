@@ -147,7 +147,7 @@ def follow(plant: Plant) -> np.ndarray:
 
 def test_delayed_commands_start_late(plant):
   """``control_delay`` counts steps of MuJoCo, 5 ms each."""
-  begin(plant, control_delay=np.float32(4))
+  begin(plant, control_delay=np.asarray(4.0))
   plant.step(FIRST, 0.0, 0.018)
   still = plant.bodies.state()[0][:6]
   np.testing.assert_allclose(still, plant.scene.keyframe("neutral")[:6], atol=1e-4)
@@ -231,7 +231,9 @@ def test_frictions_of_the_pairs_become_factors():
 
 def test_worlds_have_fields_of_their_own(scene):
   mass = scene.model.body_mass.astype(np.float32) * 2
-  model = with_fields(scene.model, {"body_mass": mass, "gripper_speed": np.float32(1)})
+  model = with_fields(
+    scene.model, {"body_mass": mass, "gripper_speed": np.asarray(1.0)}
+  )
   np.testing.assert_array_equal(model.body_mass, mass)
   assert scene.model.body_mass[1] != mass[1]
 
