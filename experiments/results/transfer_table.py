@@ -85,7 +85,9 @@ def path_name(run: str) -> str:
 
 def table(results: list[dict[str, Any]]) -> str:
   """Returns the results in Markdown, a row per cell."""
-  head = "run|task|trained in|physics|renderer|looks|latency|admittance|solved|95 %"
+  head: str = (
+    "run|task|trained in|physics|renderer|looks|latency|admittance|solved|95 %"
+  )
   rows: list[list[str]] = [head.split("|")]
   for found in sorted(results, key=order):
     low, high = (100 * x for x in found["ci95"])
