@@ -41,7 +41,6 @@ FRICTION_SPEED = 0.01
 GEAR_FORCE = 100.0
 """Largest torque of a gear between fingers, N m."""
 
-
 FINGER_INERTIA = 0.1
 """Share of the fingers' armature that their links get.
 

@@ -42,6 +42,12 @@ EXPERT_CELLS = ["native/rays/plain", "bullet/rays/plain"]
 """Cells of the expert, which sees no images."""
 
 
+HEAD: list[str] = (
+  "run task trained physics renderer looks latency admittance solved 95%".split()
+)
+"""Columns of the table; trained: in plain or randomized worlds."""
+
+
 def options_of(run: str, cell: str) -> list[str]:
   """Returns the arguments of `apnpql transfer`."""
   physics, renderer, looks, *more = cell.split("/")
@@ -88,10 +94,10 @@ def table(results: list[dict[str, Any]]) -> str:
   head: str = (
     "run|task|trained in|physics|renderer|looks|latency|admittance|solved|95 %"
   )
-  rows: list[list[str]] = [head.split("|")]
+  rows = [HEAD]
   for found in sorted(results, key=order):
     low, high = (100 * x for x in found["ci95"])
-    trained = f"{found['trained']} worlds" if "trained" in found else "-"
+    trained = found["trained"] if "trained" in found else "-"
     latency = f"{found['latency_ms']} ms" if "latency_ms" in found else "-"
     yields = {True: "on", False: "off"}.get(found.get("admittance"), "-")
     solved = f"{found['successes']} of {found['episodes']}"
