@@ -41,10 +41,7 @@ CELLS = [
 EXPERT_CELLS = ["native/rays/plain", "bullet/rays/plain"]
 """Cells of the expert, which sees no images."""
 
-
-HEAD: list[str] = (
-  "run task trained physics renderer looks latency admittance solved 95%".split()
-)
+HEAD = "run task trained physics renderer looks latency admittance solved 95%"
 """Columns of the table; trained: in plain or randomized worlds."""
 
 
@@ -91,13 +88,10 @@ def path_name(run: str) -> str:
 
 def table(results: list[dict[str, Any]]) -> str:
   """Returns the results in Markdown, a row per cell."""
-  head: str = (
-    "run|task|trained in|physics|renderer|looks|latency|admittance|solved|95 %"
-  )
-  rows = [HEAD]
+  rows = [list[str](HEAD.split())]
   for found in sorted(results, key=order):
     low, high = (100 * x for x in found["ci95"])
-    trained = found["trained"] if "trained" in found else "-"
+    trained = found.get("trained", "-")
     latency = f"{found['latency_ms']} ms" if "latency_ms" in found else "-"
     yields = {True: "on", False: "off"}.get(found.get("admittance"), "-")
     solved = f"{found['successes']} of {found['episodes']}"
