@@ -3,8 +3,9 @@
   python -m benchmarks.quality.transfer_sheet
 
 Six worlds of stack_box after twelve periods of the expert, the global image above that
-of the wrist camera. From the top: rays, OpenGL with plain looks, OpenGL with the draws
-of the randomizer, OpenGL with unseen looks.
+of the wrist camera. From the top, in MuJoCo: rays, OpenGL with plain looks, OpenGL with
+the draws of the randomizer, OpenGL with unseen looks. In Bullet: TinyRenderer with
+plain and with unseen looks.
 """
 
 import dataclasses
@@ -17,10 +18,13 @@ import numpy as np
 
 from apnpql_jax import runtime
 from apnpql_jax.config.schema import EnvConfig
-from apnpql_jax.envs.env import make_env
+from apnpql_jax.envs.env import Env, make_env
+from apnpql_jax.envs.state import EnvState
 from apnpql_jax.training.rollout import expert_policy, rollout
 from apnpql_jax.transfer.opengl import OpenGL
+from apnpql_jax.transfer.tiny import Tiny
 from apnpql_jax.transfer.transfer import make_draw
+from apnpql_jax.transfer.worlds import Worlds
 from benchmarks.common import store
 from benchmarks.quality.randomization_sheet import PERIODS, WORLDS, tile
 
@@ -39,20 +43,36 @@ def main() -> None:
 
 def sheet(config: EnvConfig) -> list[np.ndarray]:
   """Returns the rows of tiles, u8[H, W, 3] each."""
-  rows = []
-  for randomize in (False, True):
-    env = make_env(dataclasses.replace(config, randomize=randomize))
-    policy = expert_policy(env, noise=0.0)
-    play = jax.jit(lambda s, k: rollout(env, policy, s, k, length=PERIODS)[0])  # noqa: B023
-    state = play(env.reset(jnp.asarray(ROWS)), jax.random.key(0))
-    if not randomize:
-      seen = state.timestep.observation
-      rows.append(joined(seen.global_image, seen.wrist_image))
-    for unseen in (False,) if randomize else (False, True):
-      with OpenGL(env.task.scene, config, unseen=unseen) as gl:
-        images = make_draw(env, gl)(state.physics, ROWS, np.ones(WORLDS, bool), PERIODS)
-        rows.append(joined(*images))
-  return [*rows[:2], rows[3], rows[2]]
+  env = make_env(config)
+  state = played(env)
+  seen = state.timestep.observation
+  rows = [joined(seen.global_image, seen.wrist_image)]
+  rows.append(drawn(env, state, OpenGL, unseen=False))
+  randomized = make_env(dataclasses.replace(config, randomize=True))
+  rows.append(drawn(randomized, played(randomized), OpenGL, unseen=False))
+  rows.append(drawn(env, state, OpenGL, unseen=True))
+  with Worlds(env, latency_s=0.03, admittance=False) as worlds:
+    state, act = env.reset(jnp.asarray(ROWS)), jax.jit(env.expert_action)
+    for _ in range(PERIODS):
+      state = env.observe(worlds.advance(state, act(state), np.ones(WORLDS, bool)))
+  rows += [drawn(env, state, Tiny, unseen=unseen) for unseen in (False, True)]
+  return rows
+
+
+def played(env: Env) -> EnvState:
+  """Returns the worlds after the expert has played for a while."""
+  policy = expert_policy(env, noise=0.0)
+  play = jax.jit(lambda s, k: rollout(env, policy, s, k, length=PERIODS)[0])
+  return play(env.reset(jnp.asarray(ROWS)), jax.random.key(0))
+
+
+def drawn(
+  env: Env, state: EnvState, renderer: type[OpenGL | Tiny], *, unseen: bool
+) -> np.ndarray:
+  """Returns a row of tiles by a renderer."""
+  with renderer(env.task.scene, env.config, unseen=unseen) as opened:
+    draw = make_draw(env, opened)
+    return joined(*draw(state.physics, ROWS, np.ones(WORLDS, bool), PERIODS))
 
 
 def joined(overviews: jax.Array, wrists: jax.Array) -> np.ndarray:
