@@ -23,7 +23,8 @@ class Worlds:
     self._stack = contextlib.ExitStack()
     self._env = env
     self._options: dict[str, Any] = {"latency_s": latency_s, "admittance": admittance}
-    self._plants: list[Plant] = []
+    self.plants: list[Plant] = []
+    """By world; ``advance`` adds them."""
 
   def __enter__(self) -> Worlds:
     return self
@@ -40,11 +41,11 @@ class Worlds:
     """
     physics: Any = jax.tree.map(np.array, state.physics)
     commands, elapsed = np.asarray(action), np.asarray(state.elapsed)
-    while len(self._plants) < len(running):
+    while len(self.plants) < len(running):
       plant = Plant(self._env.task.scene, **self._options)
-      self._plants.append(self._stack.enter_context(plant))
+      self.plants.append(self._stack.enter_context(plant))
     for world in np.flatnonzero(running):
-      plant = self._plants[world]
+      plant = self.plants[world]
       if not elapsed[world]:
         fields = {name: x[world] for name, x in physics.fields.items()}
         poses = (x[world] for x in (physics.mocap_pos, physics.mocap_quat))

@@ -45,7 +45,7 @@ def sheet(config: EnvConfig) -> list[np.ndarray]:
   """Returns the rows of tiles, u8[H, W, 3] each."""
   env = make_env(config)
   state = played(env)
-  seen = state.timestep.observation
+  seen: Any = state.timestep.observation
   rows = [joined(seen.global_image, seen.wrist_image)]
   rows.append(drawn(env, state, OpenGL, unseen=False))
   randomized = make_env(dataclasses.replace(config, randomize=True))

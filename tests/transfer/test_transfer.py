@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 import dataclasses
 from pathlib import Path
+from typing import Any
 
+import imageio.v3 as iio
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,15 +21,18 @@ from apnpql_jax.envs.state import EnvState
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.randomization.randomize import make_randomize
 from apnpql_jax.sim.kinematics import make_kinematics
+from apnpql_jax.sim.physics import START_TIME
 from apnpql_jax.tasks import Task
 from apnpql_jax.training.rollout import expert_policy, make_player
 from apnpql_jax.training.train import train
-from apnpql_jax.transfer import looks
+from apnpql_jax.training.video import HOLD
+from apnpql_jax.transfer import film, looks
 from apnpql_jax.transfer.cell import Cell
 from apnpql_jax.transfer.graphics import area_resized
 from apnpql_jax.transfer.opengl import OpenGL
-from apnpql_jax.transfer.play import play
+from apnpql_jax.transfer.play import Played, play
 from apnpql_jax.transfer.transfer import make_draw, transfer, transfer_expert
+from apnpql_jax.transfer.worlds import Worlds
 
 CONFIG = dataclasses.replace(testing.TINY.env, task="push_plate")
 
@@ -86,6 +91,52 @@ def test_the_loop_plays_the_episodes_of_the_player(env):
   np.testing.assert_array_equal(found.length, expected.length)
   assert [len(x) for x in found.stages] == found.length.tolist()
   assert found.success.any()
+
+
+def test_bullet_moves_the_worlds_that_still_run(env):
+  """The state holds Bullet's poses, and an episode goes on without a reset."""
+  pytest.importorskip("pybullet")
+  state, act = env.reset(jnp.asarray(ROWS)), jax.jit(env.expert_action)
+  running = np.array([True, True, False])
+  with Worlds(env, latency_s=0.0, admittance=False) as worlds:
+    for _ in range(3):
+      before = state.physics
+      state = env.observe(worlds.advance(state, act(state), running))
+      for world in (0, 1):
+        qpos, qvel = worlds.plants[world].bodies.state()
+        np.testing.assert_allclose(state.physics.qpos[world], qpos, atol=1e-6)
+        np.testing.assert_allclose(state.physics.qvel[world], qvel, atol=1e-5)
+    moved = np.abs(state.physics.qpos - before.qpos)[:, env.task.scene.arm_qpos].max(1)
+    assert (moved[:2] > 0.01).all() and moved[2] == 0.0
+  assert state.elapsed.tolist() == [3, 3, 3] and not state.faults.any()
+  period = env.config.control_period_s
+  np.testing.assert_allclose(state.physics.time[0] - START_TIME, 3 * period, rtol=1e-5)
+
+
+def test_a_world_that_bullet_breaks_counts_as_a_fault(env, monkeypatch):
+  pytest.importorskip("pybullet")
+  state = env.reset(jnp.asarray(ROWS))
+  with Worlds(env, latency_s=0.0, admittance=False) as worlds:
+    worlds.advance(state, jnp.zeros((3, 7)), np.ones(3, bool))
+    nothing = (
+      np.full(env.task.scene.model.nq, np.nan),
+      worlds.plants[1].bodies.state()[1],
+    )
+    monkeypatch.setattr(worlds.plants[1].bodies, "state", lambda: nothing)
+    later = state.replace(elapsed=state.elapsed + 1)
+    arrival = worlds.advance(later, jnp.zeros((3, 7)), np.ones(3, bool))
+  assert arrival.faults.tolist() == [0, 1, 0]
+
+
+def test_video_shows_the_first_success_and_the_first_failure():
+  nothing: Any = None
+  batches = [
+    Played(np.array(solved), nothing, [], nothing, nothing, nothing)
+    for solved in ([True, True], [False, True])
+  ]
+  assert film.first(batches, success=True) == 0
+  assert film.first(batches, success=False) == 2
+  assert film.first(batches[:1], success=False) is None
 
 
 @pytest.mark.parametrize("randomize", [False, True])
@@ -177,6 +228,10 @@ def test_a_policy_from_pixels_plays_in_opengl(instants, tmp_path: Path, plain):
   )
   train(config, tmp_path / "run")
   for cell in (Cell(looks="plain"), Cell(renderer="opengl", looks="unseen")):
-    found = transfer(tmp_path / "run", cell, episodes=4)
+    video = tmp_path / f"{cell.renderer}.mp4"
+    found = transfer(tmp_path / "run", cell, episodes=4, video=video)
+    assert found["video"] == str(video)
+    assert {found["success"], found["failure"]} != {None}
+    assert iio.imread(video).shape[0] <= 2 * (4 + HOLD)
     assert found["episodes"] == 4 and found["mean_length"] <= 4
     assert found["trained"] == "plain"
