@@ -31,15 +31,13 @@ from apnpql_jax.transfer.graphics import (
   given,
   light_of,
 )
+from apnpql_jax.transfer.shapes import shape
 
 KEPT = 64
 """Worlds that stay loaded."""
 
 _NEAR, _FAR = 0.01, 10.0  # m
-_TABLE = 4.0  # m, half the side of the square that stands for a plane
-_REPEAT = 1.5  # textures of the table per meter, about as in ``opengl``
 _LIGHT_M = 3.0  # m, where the light stands for its shadows
-_SIDES, _RINGS = 20, 5  # of round shapes, around and from the equator to a pole
 
 
 class Tiny:
@@ -202,8 +200,8 @@ class _World:
     self, kind: int, size: np.ndarray, rgb: Any, texture: tuple[str, int] | None
   ) -> int:
     client, rgba = self.client, [*np.asarray(rgb, float).tolist(), 1.0]
-    shape = client.createVisualShape(rgbaColor=rgba, **_shape(client, kind, size))
-    body = client.createMultiBody(0, -1, shape)
+    visual = client.createVisualShape(rgbaColor=rgba, **shape(client, kind, size))
+    body = client.createMultiBody(0, -1, visual)
     if texture:
       number = self._texture(*texture)
       client.changeVisualShape(body, -1, textureUniqueId=number)
@@ -222,75 +220,6 @@ class _World:
   def _put(self, body: int, pos: np.ndarray, mat: np.ndarray) -> None:
     quat = Rotation.from_matrix(np.reshape(mat, (3, 3))).as_quat()
     self.client.resetBasePositionAndOrientation(body, pos.tolist(), quat.tolist())
-
-
-def _shape(client: Any, kind: int, size: np.ndarray) -> dict[str, Any]:
-  """Returns the arguments of PyBullet's shape for one of MuJoCo's.
-
-  PyBullet's own cylinders and capsules have the shades of other shapes.
-  """
-  kinds, radius, half = mujoco.mjtGeom, float(size[0]), float(size[1])
-  if kind == kinds.mjGEOM_BOX:
-    return {"shapeType": client.GEOM_BOX, "halfExtents": size.tolist()}
-  if kind == kinds.mjGEOM_PLANE:
-    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    points, normals = _TABLE * corners, np.tile([0.0, 0.0, 1.0], (4, 1))
-    faces, uvs = [0, 1, 2, 0, 2, 3], _REPEAT * _TABLE * corners[:, :2]
-  elif kind == kinds.mjGEOM_CYLINDER:
-    outline = [(0, half), (radius, half), (radius, half)]
-    outline += [(r, -z) for r, z in reversed(outline)]
-    slopes = [(0, 1), (0, 1), (1, 0), (1, 0), (0, -1), (0, -1)]
-    points, normals, faces, uvs = _turned(np.array(outline), np.array(slopes))
-  else:
-    tilt = np.linspace(0, np.pi, 2 * _RINGS)
-    slopes = np.stack([np.sin(tilt), np.cos(tilt)], -1)
-    if kind == kinds.mjGEOM_ELLIPSOID:
-      points, normals, faces, uvs = _turned(slopes, slopes)
-      points, normals = points * size, normals / size
-      normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    else:
-      outline = radius * slopes
-      if kind == kinds.mjGEOM_CAPSULE:
-        outline[:, 1] += half * np.sign(slopes[:, 1])
-      points, normals, faces, uvs = _turned(outline, slopes)
-  return {
-    "shapeType": client.GEOM_MESH,
-    "vertices": points.tolist(),
-    "indices": faces,
-    "uvs": uvs.tolist(),
-    "normals": normals.tolist(),
-  }
-
-
-def _turned(
-  outline: np.ndarray, slopes: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, list[int], np.ndarray]:
-  """Turns an outline about the z axis.
-
-  Args:
-    outline: Distances from the axis and heights f64[n, 2], from the top, m.
-    slopes: Normals f64[n, 2] there.
-
-  Returns:
-    Points, normals, triangles and texture coordinates.
-  """
-  turn = np.linspace(0, 2 * np.pi, _SIDES + 1)
-  around = np.stack([np.cos(turn), np.sin(turn)], -1)
-
-  def spread(pairs: np.ndarray) -> np.ndarray:
-    flat = pairs[:, None, :1] * around
-    height = np.broadcast_to(pairs[:, None, 1:], (*flat.shape[:2], 1))
-    return np.concatenate([flat, height], -1).reshape(-1, 3).astype(float)
-
-  faces = []
-  for row in range(len(outline) - 1):
-    for side in range(_SIDES):
-      a = row * (_SIDES + 1) + side
-      b = a + _SIDES + 1
-      faces += [a, b, a + 1, a + 1, b, b + 1]
-  down, across = np.meshgrid(np.linspace(0, 1, len(outline)), turn, indexing="ij")
-  uvs = np.stack([across / (2 * np.pi), down], -1).reshape(-1, 2)
-  return spread(outline), spread(slopes), faces, uvs
 
 
 def _bytes(rgb: Any) -> np.ndarray:

@@ -145,6 +145,16 @@ def follow(plant: Plant) -> np.ndarray:
   return np.array(path)
 
 
+def test_servos_overcome_friction(plant):
+  """Gravity does not turn the first joint, whose axis is vertical."""
+  begin(plant)
+  for _ in range(4):
+    plant.step(np.array([0.3, 0, 0, 0, 0, 0]), 0.0, PERIOD_S)
+  bodies, pan = plant.bodies, plant.scene.model.joint("shoulder_pan").id
+  torque = bodies.client.getJointState(bodies.robot, bodies.joints[pan])[3]
+  assert torque == pytest.approx(0.03 * 150.0, rel=0.01)  # N m
+
+
 def test_delayed_commands_start_late(plant):
   """``control_delay`` counts steps of MuJoCo, 5 ms each."""
   begin(plant, control_delay=np.asarray(4.0))
