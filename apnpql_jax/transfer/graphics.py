@@ -56,6 +56,11 @@ def area_resized(image: np.ndarray, factor: int) -> np.ndarray:
   return (blocks.mean((1, 3)) + 0.5).astype(np.uint8)
 
 
+def color_bytes(rgb: Any) -> np.ndarray:
+  """Returns a color f64[3] in [0, 1] as u8[3]."""
+  return (255 * np.asarray(rgb, float).clip(0, 1) + 0.5).astype(np.uint8)
+
+
 def off_screen(width: int, height: int) -> Any:
   """Returns a current OpenGL context without a window.
 

@@ -20,6 +20,7 @@ from apnpql_jax.transfer.graphics import (
   CAMERAS,
   OVERSAMPLING,
   area_resized,
+  color_bytes,
   light_of,
   off_screen,
 )
@@ -119,7 +120,8 @@ class OpenGL:
         mujoco.mjtCatBit.mjCAT_ALL,
         self._scene,
       )
-      self._add_walls(background)
+      if look:
+        self._add_walls(background)
       for thing in look.clutter if look else ():
         self._add(thing.shape, thing.size, thing.pos, thing.mat, thing.rgb)
         self._scene.geoms[self._scene.ngeom - 1].matid = self._surfaces[thing.surface]
@@ -128,7 +130,10 @@ class OpenGL:
         np.zeros((height, width, 3), "u1"),
       )
       mujoco.mjr_render(view, self._scene, self._context)
-      mujoco.mjr_readPixels(pixels, None, view, self._context)
+      depth = np.zeros((height, width), np.float32)
+      mujoco.mjr_readPixels(pixels, depth, view, self._context)
+      if not look:  # Walls would be lit.
+        pixels[depth == 1.0] = color_bytes(background)
       image = area_resized(pixels[::-1], OVERSAMPLING)
       if look:
         rng = np.random.default_rng([looks.VERSION, row, time, index])

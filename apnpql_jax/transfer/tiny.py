@@ -28,6 +28,7 @@ from apnpql_jax.transfer.graphics import (
   CAMERAS,
   OVERSAMPLING,
   area_resized,
+  color_bytes,
   given,
   light_of,
 )
@@ -111,7 +112,7 @@ class Tiny:
       image = world.image(
         self._sizes[index], eye, np.reshape(mat, (3, 3)), angles[camera], lighting
       )
-      image = np.where(image[..., 3:] > 0, image[..., :3], _bytes(background))
+      image = np.where(image[..., 3:] > 0, image[..., :3], color_bytes(background))
       image = area_resized(image.astype(np.uint8), OVERSAMPLING)
       if look:
         rng = np.random.default_rng([looks.VERSION, row, time, index])
@@ -220,7 +221,3 @@ class _World:
   def _put(self, body: int, pos: np.ndarray, mat: np.ndarray) -> None:
     quat = Rotation.from_matrix(np.reshape(mat, (3, 3))).as_quat()
     self.client.resetBasePositionAndOrientation(body, pos.tolist(), quat.tolist())
-
-
-def _bytes(rgb: Any) -> np.ndarray:
-  return (255 * np.asarray(rgb, float).clip(0, 1) + 0.5).astype(np.uint8)

@@ -10,6 +10,7 @@ from typing import Any
 import imageio.v3 as iio
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -20,9 +21,11 @@ from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.envs.state import EnvState
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.randomization.randomize import make_randomize
+from apnpql_jax.render import Lighting
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.sim.physics import START_TIME
-from apnpql_jax.tasks import Task
+from apnpql_jax.sim.scene import Scene
+from apnpql_jax.tasks import make_task
 from apnpql_jax.training.rollout import expert_policy, make_player
 from apnpql_jax.training.train import train
 from apnpql_jax.training.video import HOLD
@@ -31,6 +34,7 @@ from apnpql_jax.transfer.cell import Cell
 from apnpql_jax.transfer.graphics import area_resized
 from apnpql_jax.transfer.opengl import OpenGL
 from apnpql_jax.transfer.play import Played, play
+from apnpql_jax.transfer.tiny import Tiny
 from apnpql_jax.transfer.transfer import make_draw, transfer, transfer_expert
 from apnpql_jax.transfer.worlds import Worlds
 
@@ -47,17 +51,17 @@ def env() -> Env:
 
 @pytest.fixture(scope="module")
 def plain(env: Env) -> Iterator[OpenGL]:
-  yield from opened(env.task, unseen=False)
+  yield from opened(env.task.scene, OpenGL, unseen=False)
 
 
 @pytest.fixture(scope="module")
 def strange(env: Env) -> Iterator[OpenGL]:
-  yield from opened(env.task, unseen=True)
+  yield from opened(env.task.scene, OpenGL, unseen=True)
 
 
-def opened(task: Task, *, unseen: bool) -> Iterator[OpenGL]:
+def opened(scene: Scene, renderer: type, *, unseen: bool) -> Iterator[Any]:
   try:
-    gl = OpenGL(task.scene, CONFIG, unseen=unseen)
+    gl = renderer(scene, CONFIG, unseen=unseen)
   except ConfigError as error:
     if "needs EGL or OSMesa" not in str(error):
       raise
@@ -155,6 +159,24 @@ def test_opengl_sees_what_the_ray_caster_sees(randomize, plain, env, state):
     # Edges and the shades of curved surfaces differ.
     assert (difference < 25).mean() > 0.9
     assert expected.std() > 10
+
+
+@pytest.mark.parametrize("renderer", [OpenGL, Tiny])
+def test_background_has_the_color_of_the_ray_caster(renderer):
+  """The wrist camera of this task sees beyond the table."""
+  if renderer is Tiny:
+    pytest.importorskip("pybullet")
+  scene = make_task("flip_cup").scene
+  data = mujoco.MjData(scene.model)
+  data.qpos[:] = scene.keyframe("neutral")
+  mujoco.mj_forward(scene.model, data)
+  names = "geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat"
+  poses = {name: np.array(getattr(data, name)) for name in names}
+  expected = 255 * np.array(Lighting().background)
+  for gl in opened(scene, renderer, unseen=False):
+    _, wrist = gl.draw(poses, {}, row=0, time=0)
+    sky = (np.abs(wrist - expected) < 1).all(-1)
+    assert sky.mean() > 0.02 and sky[0].any()
 
 
 def test_unseen_looks_follow_from_version_and_row(strange, plain, env, state):
