@@ -248,6 +248,28 @@ def test_worlds_have_fields_of_their_own(scene):
   assert scene.model.body_mass[1] != mass[1]
 
 
+def test_a_randomized_world_stands_in_bullet_as_in_mujoco(plant):
+  """A robot that stands lower and turned, a larger and heavier box."""
+  model, box = plant.scene.model, plant.scene.model.body("yellow").id
+  base = model.body("base").id
+  pos, quat = model.body_pos.copy(), model.body_quat.copy()
+  mass, size = model.body_mass.copy(), model.geom_size.copy()
+  pos[base, 2], mass[box], size[model.geom("yellow").id] = -0.02, 0.2, 0.03
+  quat[base] = [0.8, 0.0, 0.0, 0.6]
+  qpos = begin(plant, body_pos=pos, body_quat=quat, body_mass=mass, geom_size=size)
+  world = with_fields(model, {"body_pos": pos, "body_quat": quat})
+  data = mujoco.MjData(world)
+  data.qpos[:] = qpos
+  mujoco.mj_kinematics(world, data)
+  hand = model.body("gripper").id
+  found, _ = plant.bodies.pose(hand)
+  np.testing.assert_allclose(found, data.xpos[hand], atol=1e-4)
+  client = plant.bodies.client
+  assert client.getDynamicsInfo(*plant.bodies.place[box])[0] == pytest.approx(0.2)
+  low, high = map(np.array, client.getAABB(*plant.bodies.place[box]))
+  np.testing.assert_allclose(high - low, 0.06, atol=5e-3)
+
+
 @pytest.mark.parametrize(
   ("cell", "words"),
   [
