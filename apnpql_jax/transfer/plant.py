@@ -24,10 +24,7 @@ from apnpql_jax.sim.scene import Scene
 from apnpql_jax.transfer import bullet, contacts
 
 ITERATIONS = 300
-"""Iterations of Bullet's solver, which makes a step of 2 ms per command of the servos.
-
-With 100, a cup creeps between the pads and slowly pushes the hand open.
-"""
+"""Iterations of Bullet's solver; a step takes 2 ms, as a cycle of the servos."""
 
 SERVO_GAIN = 0.1
 """Share of the position error that a servo removes in a step."""
@@ -44,7 +41,7 @@ GEAR_FORCE = 100.0
 FINGER_INERTIA = 0.1
 """Share of the fingers' armature that their links get.
 
-With none, the solver is far from converged in a grip, and the gears give way.
+With none, the solver converges badly in a grip, and the fingers differ.
 """
 
 GEAR_ERP = 0.2
@@ -82,7 +79,7 @@ class Plant:
     client.setPhysicsEngineParameter(
       fixedTimeStep=TIMESTEP, numSolverIterations=ITERATIONS
     )
-    self.bodies = bodies = bullet.Bodies(client, model)
+    self.bodies = bodies = bullet.Bodies(client, model, hulls=True)
     bodies.reset(qpos, mocap_pos, mocap_quat)
     arm, finger = model.actuator_trnid[:6, 0], int(model.actuator_trnid[6, 0])
     self._arm = [bodies.joints[int(joint)] for joint in arm]
