@@ -181,4 +181,5 @@ def random_batch(
     primitives_tm1=action(batch, 3),
     weight=jnp.ones(batch),
     window=slots(batch, windows) if windows else None,
+    expert_tm1=action(batch),
   )
