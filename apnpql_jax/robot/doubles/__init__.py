@@ -13,6 +13,8 @@ import os
 from typing import Any
 
 from apnpql_jax.robot.doubles.child import Child
+from apnpql_jax.robot.drivers.gripper import RHP12RN, connect
+from apnpql_jax.robot.drivers.rh_p12_rn import RNA
 from apnpql_jax.robot.drivers.ur5e import UR5e
 
 PAYLOAD_KG = 0.488
@@ -25,10 +27,10 @@ _COUNT = itertools.count()
 class Doubles:
   """The devices, connected through their drivers, and their faults."""
 
-  def __init__(self, server: Child, arm: UR5e):
+  def __init__(self, server: Child, arm: UR5e, gripper: RHP12RN):
     """Keeps the devices and the process behind them."""
     self._server = server
-    self.arm = arm
+    self.arm, self.gripper = arm, gripper
 
   def drop_rtde(self) -> None:
     """Cuts the connection to the arm for good."""
@@ -46,6 +48,14 @@ class Doubles:
     """Ends the program on the controller, as the teach pendant can."""
     self._server.ask("stop_program")
 
+  def silence_gripper(self) -> None:
+    """Makes the gripper ignore its bus, as without power."""
+    self._server.ask("silence_gripper")
+
+  def fail_gripper(self) -> None:
+    """Makes the gripper report an overload."""
+    self._server.ask("fail_gripper")
+
   def state(self) -> dict[str, Any]:
     """Returns the plant's true state: position, target, finger, qpos, mocap poses."""
     return self._server.ask("state")
@@ -53,37 +63,56 @@ class Doubles:
 
 @contextlib.contextmanager
 def start(
-  task: str,
-  contract: dict[str, Any] | None = None,
-  *,
-  noise: bool = True,
-  controller: dict[str, Any] | None = None,
+  task: str, contract: dict[str, Any] | None = None, **settings: Any
 ) -> Generator[Doubles]:
   """Starts the doubles and connects the drivers to them.
 
   Args:
     task: Name of the task, or path of its MJCF file.
     contract: That of the policy, see ``deploy.contract``; no cameras without.
-    noise: Whether the force-torque sensor is noisy.
-    controller: Arguments of ``controller.Controller``.
+    settings: See ``serve``.
 
   Raises:
     UserError: A package is missing, or a double cannot start.
   """
-  host = _address()
-  settings = {
-    "scene": task,
-    "host": host,
-    "noise": noise,
-    "controller": controller or {},
-  }
   with contextlib.ExitStack() as stack:
-    server = Child("apnpql_jax.robot.doubles.server", settings)
+    server = serve(task, **settings)
     stack.callback(server.close)
+    host, terminal = server.greeting
     arm = UR5e(host, payload_kg=PAYLOAD_KG, payload_cog_m=PAYLOAD_COG_M)
     arm.connect()
     stack.callback(arm.disconnect)
-    yield Doubles(server, arm)
+    gripper = connect(terminal)
+    stack.callback(gripper.disconnect)
+    yield Doubles(server, arm, gripper)
+
+
+def serve(
+  task: str,
+  *,
+  noise: bool = True,
+  gripper: int = RNA.model_number,
+  model_number: int | None = None,
+  **controller: Any,
+) -> Child:
+  """Starts the doubles of arm and gripper; greets with address and serial port.
+
+  Args:
+    task: Name of the task, or path of its MJCF file.
+    noise: Whether the force-torque sensor is noisy.
+    gripper: Model number of the gripper.
+    model_number: What it gives as its model number, if not that.
+    controller: Arguments of ``controller.Controller``.
+  """
+  settings = {
+    "scene": task,
+    "host": _address(),
+    "noise": noise,
+    "gripper": gripper,
+    "model_number": model_number,
+    "controller": controller,
+  }
+  return Child("apnpql_jax.robot.doubles.server", settings)
 
 
 def _address() -> str:

@@ -41,7 +41,7 @@ class Child:
     )
     theirs.close()
     try:
-      self.ask(settings)
+      self.greeting = self.ask(settings)
     except BaseException:
       self.close()
       raise

@@ -157,7 +157,7 @@ class Plant:
 
   def _finger_torque(self) -> float:
     wanted = _clipped(50.0 * (self._finger_goal - self.finger), self._finger_speed)
-    return _clipped(10.0 * (wanted - self.finger_velocity), self._grip)
+    return _clipped(25.0 * (wanted - self.finger_velocity), self._grip)
 
   def _measure(self) -> np.ndarray:
     """Returns the reading of the force-torque sensor, N and N m in base axes."""

@@ -16,8 +16,10 @@ from typing import Any
 
 from apnpql_jax.robot.doubles import child
 from apnpql_jax.robot.doubles.controller import VERSION, Controller
+from apnpql_jax.robot.doubles.dynamixel import Gripper, open_terminal
 from apnpql_jax.robot.doubles.plant import STEP, Plant
 from apnpql_jax.robot.doubles.rtde import Session
+from apnpql_jax.robot.drivers.rh_p12_rn import TABLES
 
 DASHBOARD, SCRIPT, RTDE = 29999, 30003, 30004  # ports of every UR controller
 GREETING = b"Connected: Universal Robots Dashboard Server\n"
@@ -157,13 +159,23 @@ class Server:
 class Faults:
   """What the parent process may ask for, by name."""
 
-  def __init__(self, plant: Plant, controller: Controller, server: Server):
+  def __init__(
+    self, plant: Plant, controller: Controller, gripper: Gripper, server: Server
+  ):
     """Keeps what it acts on."""
-    self._plant, self._server = plant, server
+    self._plant, self._gripper = plant, gripper
     self.protective_stop = controller.protective_stop
     self.emergency_stop = controller.emergency_stop
     self.stop_program = controller.stop_program
     self.drop_rtde = server.drop
+
+  def silence_gripper(self) -> None:
+    """Makes the gripper ignore its bus."""
+    self._gripper.silent = True
+
+  def fail_gripper(self) -> None:
+    """Makes the gripper report an overload."""
+    self._gripper.fail(1 << 5)
 
   def state(self) -> dict[str, Any]:
     """Returns the true state of the plant."""
@@ -184,14 +196,19 @@ def main(pipe: Connection) -> None:
   plant = Plant(settings["scene"], noise=settings["noise"])
   controller = Controller(plant, **settings["controller"])
   server = Server(settings["host"], controller)
-  faults = Faults(plant, controller, server)
+  gripper = Gripper(
+    TABLES[settings["gripper"]], plant, model_number=settings["model_number"]
+  )
+  terminal, descriptor, read = open_terminal(gripper.receive)
+  server.watch(descriptor, read)
+  faults = Faults(plant, controller, gripper, server)
 
   def command() -> None:
     pipe.send(getattr(faults, pipe.recv())())
 
   server.watch(pipe, command)
-  pipe.send(None)
-  server.run()
+  pipe.send((settings["host"], terminal))
+  server.run(gripper.cycle)
 
 
 if __name__ == "__main__":

@@ -166,7 +166,7 @@ def test_a_collision_is_a_protective_stop(rig):
 def test_a_controller_that_will_not_do_is_one_line(controller, text):
   with (
     pytest.raises(DeviceError, match=text) as error,
-    doubles.start("push_plate", controller=controller),
+    doubles.start("push_plate", **controller),
   ):
     pass
   assert "\n" not in str(error.value)

@@ -1,0 +1,253 @@
+"""The grippers RH-P12-RN and RH-P12-RN(A), by ``dynamixel-sdk`` (protocol 2.0).
+
+The bus is slow (one reading takes about 10 ms at 57,600 baud), so a thread reads the
+finger's angle and writes commands. While the fingers move, it adapts their velocity to
+their angle, so that the gap changes at the constant speed of the training. Modbus-RTU,
+to which an RH-P12-RN(A) can be switched, is not supported: switch Protocol Type(13)
+back to 2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import math
+import threading
+import time
+from typing import Any
+
+from apnpql_jax.errors import DeviceError, one_line
+from apnpql_jax.robot.drivers import vendor
+from apnpql_jax.robot.drivers.rh_p12_rn import (
+  CLOSED,
+  ERRORS,
+  OPEN,
+  POSITION_MODE,
+  TABLES,
+  TICK,
+  Field,
+  Table,
+  finger_speed,
+  torque,
+)
+from apnpql_jax.robot.protocols import GripperState
+from apnpql_jax.sim.motors import GRIPPER_TORQUE
+
+BAUD = 57600  # the factory setting
+CURRENT_SHARE = GRIPPER_TORQUE / torque(1.0)
+"""Share of the largest current whose torque is about that of the training."""
+
+_TRIES = 5  # of a packet, each of about 40 ms, before the gripper counts as lost
+_PERIOD = 0.005  # s between two readings at least
+_ERROR_PERIOD = 0.5  # s between two readings of the hardware error status
+_REVOLUTION = 2 * math.pi / 60  # rad/s per rev/min
+
+
+def connect(port: str, **settings: Any) -> RHP12RN:
+  """Returns the gripper at a serial port, connected; ``settings`` as of ``RHP12RN``.
+
+  Raises:
+    DeviceError: See ``RHP12RN.connect``.
+  """
+  gripper = RHP12RN(port, **settings)
+  gripper.connect()
+  return gripper
+
+
+class RHP12RN:
+  """A ``Gripper`` on a serial port."""
+
+  def __init__(
+    self,
+    port: str,
+    *,
+    baud: int = BAUD,
+    device_id: int = 1,
+    current_share: float = CURRENT_SHARE,
+  ):
+    """Stores the settings; ``connect`` opens the port.
+
+    Args:
+      port: Serial port, such as /dev/ttyUSB0.
+      baud: Bits per second, as set in the gripper.
+      device_id: ID on the bus, as set in the gripper.
+      current_share: Limit of the current, and so of the force, in (0, 1].
+    """
+    self._where, self._baud, self._id = port, baud, device_id
+    self._share = current_share
+    self._sdk: Any = None
+    self._port: Any = None
+    self._packets: Any = None
+    self._table: Table | None = None
+    self._about: dict[str, Any] = {}
+    self._thread: threading.Thread | None = None
+    self._ending = threading.Event()
+    self._state: GripperState | None = None
+    self._error = ""
+    self._goal: int | None = None
+
+  def connect(self) -> None:
+    """See ``protocols.Device``; identifies the model.
+
+    Raises:
+      DeviceError: The port cannot be opened, nothing answers, or another device does.
+    """
+    self._sdk = sdk = vendor("dynamixel_sdk", "dynamixel-sdk")
+    self._port, self._packets = sdk.PortHandler(self._where), sdk.PacketHandler(2.0)
+    try:
+      self._port.setBaudRate(self._baud)  # Opens the port.
+    except Exception as error:  # Those of pyserial, and of termios.
+      raise DeviceError(f"gripper: {one_line(error)}") from None
+    self._goal, self._error = None, ""
+    try:
+      self._table = self._identify()
+      self._prepare(self._table)
+      self._state = self._read_state()
+    except DeviceError as error:
+      self._port.closePort()
+      raise DeviceError(f"gripper: {error}") from None
+    self._ending.clear()
+    self._thread = threading.Thread(target=self._serve, daemon=True)
+    self._thread.start()
+
+  def disconnect(self) -> None:
+    """See ``protocols.Device``; the fingers hold what they hold."""
+    self._ending.set()
+    if self._thread:
+      self._thread.join(1.0)
+      self._thread = None
+      self._port.closePort()
+
+  def describe(self) -> dict[str, Any]:
+    """See ``protocols.Device``; the gripper has no serial number to read."""
+    return dict(self._about)
+
+  def get_observation(self) -> GripperState:
+    """See ``protocols.Gripper``.
+
+    Raises:
+      DeviceError: The gripper has fallen silent, or reports an error.
+    """
+    self._check()
+    assert self._state
+    return self._state
+
+  def send_action(self, close: bool) -> None:
+    """See ``protocols.Gripper``.
+
+    Raises:
+      DeviceError: The gripper has fallen silent, or reports an error.
+    """
+    self._check()
+    self._goal = CLOSED if close else OPEN
+
+  def _check(self) -> None:
+    if self._error:
+      raise DeviceError(self._error)
+    if self._thread is None:
+      raise DeviceError(f"gripper: {self._where} is not connected")
+
+  def _identify(self) -> Table:
+    try:
+      number, *_ = self._try(self._packets.ping)
+    except DeviceError:
+      raise DeviceError(
+        f"nothing answers at {self._where}, ID {self._id}, {self._baud} baud: "
+        "check power, cable, ID, baud rate and Protocol Type"
+      ) from None
+    if number not in TABLES:
+      names = " or ".join(f"{x.name} ({x.model_number})" for x in TABLES.values())
+      raise DeviceError(
+        f"the device at {self._where} has model number {number}, not {names}"
+      )
+    return TABLES[number]
+
+  def _prepare(self, table: Table) -> None:
+    """Sets mode, current and acceleration; the fingers stay where they are."""
+    if self._read(table.operating_mode) != POSITION_MODE:
+      self._write(table.torque_enable, 0)
+      self._write(table.operating_mode, POSITION_MODE)
+    current = round(self._share * table.largest_current)
+    self._fastest = self._read(table.velocity_limit)
+    # A profile with acceleration is the only one whose velocity can change on the way.
+    self._write(table.acceleration, self._read(table.acceleration_limit))
+    self._write(table.goal_current, min(current, self._read(table.current_limit)))
+    self._command(self._read(table.present_position), self._velocity(0.0))
+    self._write(table.torque_enable, 1)
+    self._about = {
+      "model": table.name,
+      "model_number": table.model_number,
+      "firmware": self._read(table.firmware),
+      "id": self._id,
+      "current_ma": current * table.milliamperes,
+    }
+
+  def _serve(self) -> None:
+    """Reads and commands until the end; an error stays until the next ``connect``."""
+    asked = 0.0
+    done: tuple[int, int] | None = None
+    while not self._ending.wait(_PERIOD):
+      try:
+        state = self._read_state()
+        self._state = state
+        if state.time - asked > _ERROR_PERIOD:
+          asked = state.time
+          self._check_hardware()
+        if (goal := self._goal) is not None:
+          wanted = goal, self._velocity(state.angle)
+          if wanted != done:
+            self._command(*wanted)
+            done = wanted
+      except Exception as error:  # That of pyserial when the adapter is pulled out.
+        self._error = f"gripper: {one_line(error)}"
+        return
+
+  def _velocity(self, angle: float) -> int:
+    """Returns the velocity of the profile at an angle, in the gripper's unit."""
+    assert self._table
+    speed = finger_speed(min(max(angle, 0.0), CLOSED * TICK))
+    return min(round(speed / (self._table.rpm * _REVOLUTION)), self._fastest)
+
+  def _command(self, goal: int, velocity: int) -> None:
+    """Writes goal and velocity, which lie next to each other, in one packet."""
+    assert self._table
+    pair = {self._table.goal_position: goal, self._table.velocity: velocity}
+    fields = sorted(pair, key=lambda field: field.address)
+    data = b"".join(pair[x].to_bytes(x.size, "little") for x in fields)
+    self._send(fields[0].address, data)
+
+  def _read_state(self) -> GripperState:
+    assert self._table
+    before = time.monotonic()
+    ticks = self._read(self._table.present_position)
+    ticks -= (ticks >> 31) << 32  # Signed.
+    return GripperState(0.5 * (before + time.monotonic()), ticks * TICK)
+
+  def _check_hardware(self) -> None:
+    assert self._table
+    bits = self._read(self._table.hardware_error)
+    if reasons := [text for bit, text in ERRORS.items() if bits & bit]:
+      raise DeviceError(
+        f"{self._where}: it stopped: {' and '.join(reasons)}; turn it off and on"
+      )
+
+  def _read(self, field: Field) -> int:
+    data, *_ = self._try(self._packets.readTxRx, field.address, field.size)
+    return int.from_bytes(bytes(data), "little")
+
+  def _write(self, field: Field, value: int) -> None:
+    self._send(field.address, value.to_bytes(field.size, "little"))
+
+  def _send(self, address: int, data: bytes) -> None:
+    *_, error = self._try(self._packets.writeTxRx, address, len(data), list(data))
+    if error & 0x7F:  # Bit 7 tells of a hardware error, which has its own reading.
+      reason = one_line(Exception(self._packets.getRxPacketError(error & 0x7F)))
+      raise DeviceError(f"{self._where}: it refuses to write {address}: {reason}")
+
+  def _try(self, call: Callable[..., tuple], *args: Any) -> tuple:
+    """Returns what a call of the SDK returns, (..., result, error); tries again."""
+    for _ in range(_TRIES):
+      answer = call(self._port, self._id, *args)
+      if answer[-2] == self._sdk.COMM_SUCCESS:
+        return answer
+      self._port.clearPort()
+    raise DeviceError(f"{self._where}: it does not answer: check its power and cable")
