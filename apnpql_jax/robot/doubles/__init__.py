@@ -12,8 +12,11 @@ import itertools
 import os
 from typing import Any
 
+from apnpql_jax.robot.doubles.cameras import cameras
 from apnpql_jax.robot.doubles.child import Child
+from apnpql_jax.robot.doubles.server import ask
 from apnpql_jax.robot.drivers.gripper import RHP12RN, connect
+from apnpql_jax.robot.drivers.realsense import RealSense
 from apnpql_jax.robot.drivers.rh_p12_rn import RNA
 from apnpql_jax.robot.drivers.ur5e import UR5e
 
@@ -27,45 +30,51 @@ _COUNT = itertools.count()
 class Doubles:
   """The devices, connected through their drivers, and their faults."""
 
-  def __init__(self, server: Child, arm: UR5e, gripper: RHP12RN):
-    """Keeps the devices and the process behind them."""
-    self._server = server
-    self.arm, self.gripper = arm, gripper
+  def __init__(
+    self, host: str, arm: UR5e, gripper: RHP12RN, cameras: dict[str, RealSense]
+  ):
+    """Keeps the devices and the address of the processes behind them."""
+    self.host = host
+    self.arm, self.gripper, self.cameras = arm, gripper, cameras
 
   def drop_rtde(self) -> None:
     """Cuts the connection to the arm for good."""
-    self._server.ask("drop_rtde")
+    ask(self.host, "drop_rtde")
 
   def protective_stop(self) -> None:
     """Stops the arm as after a collision."""
-    self._server.ask("protective_stop")
+    ask(self.host, "protective_stop")
 
   def emergency_stop(self) -> None:
     """Stops the arm as if the button was pushed."""
-    self._server.ask("emergency_stop")
+    ask(self.host, "emergency_stop")
 
   def stop_program(self) -> None:
     """Ends the program on the controller, as the teach pendant can."""
-    self._server.ask("stop_program")
+    ask(self.host, "stop_program")
 
   def silence_gripper(self) -> None:
     """Makes the gripper ignore its bus, as without power."""
-    self._server.ask("silence_gripper")
+    ask(self.host, "silence_gripper")
 
   def fail_gripper(self) -> None:
     """Makes the gripper report an overload."""
-    self._server.ask("fail_gripper")
+    ask(self.host, "fail_gripper")
+
+  def unplug_cameras(self) -> None:
+    """Ends the frames of both cameras."""
+    ask(self.host, "unplug_cameras")
 
   def state(self) -> dict[str, Any]:
     """Returns the plant's true state: position, target, finger, qpos, mocap poses."""
-    return self._server.ask("state")
+    return ask(self.host, "state")
 
 
 @contextlib.contextmanager
 def start(
   task: str, contract: dict[str, Any] | None = None, **settings: Any
 ) -> Generator[Doubles]:
-  """Starts the doubles and connects the drivers to them.
+  """Starts the doubles and connects the drivers to them, all in this process.
 
   Args:
     task: Name of the task, or path of its MJCF file.
@@ -84,7 +93,11 @@ def start(
     stack.callback(arm.disconnect)
     gripper = connect(terminal)
     stack.callback(gripper.disconnect)
-    yield Doubles(server, arm, gripper)
+    eyes = stack.enter_context(cameras(host, task, contract)) if contract else {}
+    for camera in eyes.values():
+      camera.connect()
+      stack.callback(camera.disconnect)
+    yield Doubles(host, arm, gripper, eyes)
 
 
 def serve(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import contextlib
+import importlib
 from multiprocessing.connection import Connection, Pipe
 import os
 import subprocess
@@ -17,12 +18,13 @@ from typing import Any
 
 from apnpql_jax.errors import ConfigError, DeviceError, UserError, one_line
 
+_PROGRAM = f"import sys; from {__name__} import run; run(sys.argv[1], int(sys.argv[2]))"
 _PATIENCE = 60.0  # s to start, or to answer, on a machine that is busy
 _END = 5.0  # s to end
 
 
 class Child:
-  """A process that runs ``module`` as a program; see ``run``."""
+  """A process that runs ``main`` of a module."""
 
   def __init__(self, module: str, settings: Any):
     """Starts the process, and waits until it is ready.
@@ -34,7 +36,7 @@ class Child:
     self._lock = threading.Lock()
     path = os.pathsep.join(filter(None, sys.path))
     self._process = subprocess.Popen(
-      [sys.executable, "-m", module, str(theirs.fileno())],
+      [sys.executable, "-c", _PROGRAM, module, str(theirs.fileno())],
       pass_fds=[theirs.fileno()],
       env={**os.environ, "PYTHONPATH": path},
       stdin=subprocess.DEVNULL,
@@ -74,9 +76,10 @@ class Child:
       self._process.wait()
 
 
-def run(main: Callable[[Connection], None]) -> None:
+def run(module: str, descriptor: int) -> None:
   """Runs ``main`` in the child until the parent closes the pipe; sends its error."""
-  with Connection(int(sys.argv[1])) as pipe, contextlib.suppress(EOFError, OSError):
+  main: Callable[[Connection], None] = importlib.import_module(module).main
+  with Connection(descriptor) as pipe, contextlib.suppress(EOFError, OSError):
     try:
       main(pipe)
     except (EOFError, BrokenPipeError, KeyboardInterrupt):

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import contextlib
+import json
 from multiprocessing.connection import Connection
 import selectors
 import socket
 import time
 from typing import Any
 
-from apnpql_jax.robot.doubles import child
+from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot.doubles.controller import VERSION, Controller
 from apnpql_jax.robot.doubles.dynamixel import Gripper, open_terminal
 from apnpql_jax.robot.doubles.plant import STEP, Plant
@@ -22,7 +23,9 @@ from apnpql_jax.robot.doubles.rtde import Session
 from apnpql_jax.robot.drivers.rh_p12_rn import TABLES
 
 DASHBOARD, SCRIPT, RTDE = 29999, 30003, 30004  # ports of every UR controller
+REMOTE = 30099  # of ``ask``
 GREETING = b"Connected: Universal Robots Dashboard Server\n"
+_PATIENCE = 10.0  # s
 _CATCH_UP = 10  # cycles; a machine that is later than this loses time instead
 
 
@@ -40,15 +43,29 @@ class Server:
     self._sessions: dict[socket.socket, Session] = {}
     self._scripts: dict[socket.socket, bytes] = {}
     self._mute = False
-    accepts = {DASHBOARD: self._dashboard, SCRIPT: self._script, RTDE: self._rtde}
-    for port, accept in accepts.items():
-      listener = socket.create_server((host, port))
-      listener.setblocking(False)
-      self.watch(listener, self._accepting(listener, accept))
+    self._host = host
+    self.listen(DASHBOARD, GREETING, controller.ask)
+    self._open(SCRIPT, self._script)
+    self._open(RTDE, self._rtde)
 
   def watch(self, source: Any, act: Callable[[], None]) -> None:
     """Calls ``act`` whenever something can be read from ``source``."""
     self._selector.register(source, selectors.EVENT_READ, act)
+
+  def listen(self, port: int, greeting: bytes, ask: Callable[[str], str]) -> None:
+    """Serves lines of text at a port."""
+
+    def accept(client: socket.socket) -> None:
+      client.send(greeting)
+
+      def read() -> None:
+        text = (self._receive(client) or b"").decode("ascii", "replace")
+        for line in text.splitlines():
+          client.send(ask(line).encode() + b"\n")
+
+      self.watch(client, read)
+
+    self._open(port, accept)
 
   def forget(self, source: Any) -> None:
     """Stops watching and closes a source."""
@@ -76,28 +93,20 @@ class Server:
       self._publish()
       due = max(due + STEP, time.monotonic() - _CATCH_UP * STEP)
 
-  def _accepting(self, listener: socket.socket, act: Callable[..., None]) -> Any:
+  def _open(self, port: int, act: Callable[[socket.socket], None]) -> None:
+    listener = socket.create_server((self._host, port))
+    listener.setblocking(False)
+
     def accept() -> None:
       client, _ = listener.accept()
-      if self._mute:
+      if self._mute and port == RTDE:
         client.close()
         return
       client.setblocking(False)
       client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
       act(client)
 
-    return accept
-
-  def _dashboard(self, client: socket.socket) -> None:
-    client.send(GREETING)
-
-    def read() -> None:
-      for line in (
-        (self._receive(client) or b"").decode("ascii", "replace").splitlines()
-      ):
-        client.send(self._controller.ask(line).encode() + b"\n")
-
-    self.watch(client, read)
+    self.watch(listener, accept)
 
   def _script(self, client: socket.socket) -> None:
     self._scripts[client] = b""
@@ -156,8 +165,8 @@ class Server:
         self._close(client)
 
 
-class Faults:
-  """What the parent process may ask for, by name."""
+class Remote:
+  """What other processes may ask for, by name; see ``ask``."""
 
   def __init__(
     self, plant: Plant, controller: Controller, gripper: Gripper, server: Server
@@ -168,6 +177,7 @@ class Faults:
     self.emergency_stop = controller.emergency_stop
     self.stop_program = controller.stop_program
     self.drop_rtde = server.drop
+    self._cameras = True
 
   def silence_gripper(self) -> None:
     """Makes the gripper ignore its bus."""
@@ -177,21 +187,45 @@ class Faults:
     """Makes the gripper report an overload."""
     self._gripper.fail(1 << 5)
 
+  def unplug_cameras(self) -> None:
+    """Ends the frames of the cameras."""
+    self._cameras = False
+
   def state(self) -> dict[str, Any]:
     """Returns the true state of the plant."""
     plant, data = self._plant, self._plant.data
     return {
-      "position": plant.position,
-      "target": plant.target,
+      "position": plant.position.tolist(),
+      "target": plant.target.tolist(),
       "finger": plant.finger,
-      "qpos": data.qpos.copy(),
-      "mocap_pos": data.mocap_pos.copy(),
-      "mocap_quat": data.mocap_quat.copy(),
+      "qpos": data.qpos.tolist(),
+      "mocap_pos": data.mocap_pos.tolist(),
+      "mocap_quat": data.mocap_quat.tolist(),
+      "cameras": self._cameras,
     }
+
+  def answer(self, line: str) -> str:
+    """Returns the answer to a name as JSON."""
+    return json.dumps(getattr(self, line.strip())())
+
+
+def ask(host: str, name: str) -> Any:
+  """Calls a method of ``Remote`` in the doubles at an address, from any process.
+
+  Raises:
+    DeviceError: They have ended.
+  """
+  try:
+    with socket.create_connection((host, REMOTE), _PATIENCE) as connection:
+      connection.sendall(name.encode() + b"\n")
+      with connection.makefile(encoding="ascii") as answer:
+        return json.loads(answer.readline())
+  except (OSError, ValueError):
+    raise DeviceError(f"the doubles at {host} have ended") from None
 
 
 def main(pipe: Connection) -> None:
-  """Runs arm and gripper; takes the settings, then names of methods of ``Faults``."""
+  """Runs arm and gripper with the settings of the parent, until that ends."""
   settings = pipe.recv()
   plant = Plant(settings["scene"], noise=settings["noise"])
   controller = Controller(plant, **settings["controller"])
@@ -201,15 +235,7 @@ def main(pipe: Connection) -> None:
   )
   terminal, descriptor, read = open_terminal(gripper.receive)
   server.watch(descriptor, read)
-  faults = Faults(plant, controller, gripper, server)
-
-  def command() -> None:
-    pipe.send(getattr(faults, pipe.recv())())
-
-  server.watch(pipe, command)
+  server.listen(REMOTE, b"", Remote(plant, controller, gripper, server).answer)
+  server.watch(pipe, pipe.recv)  # Raises EOFError when the parent ends.
   pipe.send((settings["host"], terminal))
   server.run(gripper.cycle)
-
-
-if __name__ == "__main__":
-  child.run(main)

@@ -36,7 +36,7 @@ BAUD = 57600  # the factory setting
 CURRENT_SHARE = GRIPPER_TORQUE / torque(1.0)
 """Share of the largest current whose torque is about that of the training."""
 
-_TRIES = 5  # of a packet, each of about 40 ms, before the gripper counts as lost
+_PATIENCE = 0.5  # s without an answer before the gripper counts as lost
 _PERIOD = 0.005  # s between two readings at least
 _ERROR_PERIOD = 0.5  # s between two readings of the hardware error status
 _REVOLUTION = 2 * math.pi / 60  # rad/s per rev/min
@@ -113,7 +113,7 @@ class RHP12RN:
     """See ``protocols.Device``; the fingers hold what they hold."""
     self._ending.set()
     if self._thread:
-      self._thread.join(1.0)
+      self._thread.join(4 * _PATIENCE)
       self._thread = None
       self._port.closePort()
 
@@ -245,7 +245,8 @@ class RHP12RN:
 
   def _try(self, call: Callable[..., tuple], *args: Any) -> tuple:
     """Returns what a call of the SDK returns, (..., result, error); tries again."""
-    for _ in range(_TRIES):
+    end = time.monotonic() + _PATIENCE
+    while time.monotonic() < end:
       answer = call(self._port, self._id, *args)
       if answer[-2] == self._sdk.COMM_SUCCESS:
         return answer
