@@ -86,11 +86,13 @@ class RHP12RN:
     self._goal: int | None = None
 
   def connect(self) -> None:
-    """See ``protocols.Device``; identifies the model.
+    """See ``protocols.Device``; identifies the model. Harmless if it is connected.
 
     Raises:
       DeviceError: The port cannot be opened, nothing answers, or another device does.
     """
+    if self._thread:
+      return
     self._sdk = sdk = vendor("dynamixel_sdk", "dynamixel-sdk")
     self._port, self._packets = sdk.PortHandler(self._where), sdk.PacketHandler(2.0)
     try:
