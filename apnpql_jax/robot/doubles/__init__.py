@@ -106,6 +106,7 @@ def serve(
   noise: bool = True,
   gripper: int = RNA.model_number,
   model_number: int | None = None,
+  modbus: bool = False,
   **controller: Any,
 ) -> Child:
   """Starts the doubles of arm and gripper; greets with address and serial port.
@@ -115,6 +116,7 @@ def serve(
     noise: Whether the force-torque sensor is noisy.
     gripper: Model number of the gripper.
     model_number: What it gives as its model number, if not that.
+    modbus: Whether the gripper speaks Modbus-RTU.
     controller: Arguments of ``controller.Controller``.
   """
   settings = {
@@ -123,6 +125,7 @@ def serve(
     "noise": noise,
     "gripper": gripper,
     "model_number": model_number,
+    "modbus": modbus,
     "controller": controller,
   }
   return Child("apnpql_jax.robot.doubles.server", settings)

@@ -72,6 +72,27 @@ class Gripper:
     share = self._get(table.goal_current) / table.largest_current
     plant.grip(goal, self._speed, torque(share))
 
+  def load(self, address: int, size: int) -> bytes:
+    """Returns registers."""
+    return bytes(self._memory[address : address + size])
+
+  def store(self, address: int, data: bytes) -> int:
+    """Writes registers; returns the error of the status packet."""
+    if address < _EEPROM and self._get(self.table.torque_enable):
+      return _ACCESS_ERROR
+    before = bytes(self._memory)
+    self._memory[address : address + len(data)] = data
+    limits = {
+      self.table.goal_current: self._get(self.table.current_limit),
+      self.table.velocity: self._get(self.table.velocity_limit),
+      self.table.acceleration: self._get(self.table.acceleration_limit),
+      self.table.goal_position: 1150,
+    }
+    if any(self._get(field) > limit for field, limit in limits.items()):
+      self._memory[:] = before
+      return _LIMIT_ERROR
+    return 0
+
   def receive(self, data: bytes) -> bytes:
     """Returns the answers to what arrived on the bus."""
     self._buffer += data
@@ -94,33 +115,16 @@ class Gripper:
     instruction = packet[7]
     body = packet[8:-2].replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")
     if instruction == _PING:
-      return self._status(0, self._memory[0:2] + self._memory[6:7])
+      return self._status(0, self.load(0, 2) + self.load(6, 1))
     address = int.from_bytes(body[:2], "little")
     if instruction == _READ:
       count = int.from_bytes(body[2:4], "little")
-      return self._status(0, self._memory[address : address + count])
+      return self._status(0, self.load(address, count))
     if instruction == _WRITE:
-      return self._status(self._store(address, body[2:]))
+      return self._status(self.store(address, body[2:]))
     return self._status(_INSTRUCTION_ERROR)
 
-  def _store(self, address: int, data: bytes) -> int:
-    """Writes registers; returns the error of the status packet."""
-    if address < _EEPROM and self._get(self.table.torque_enable):
-      return _ACCESS_ERROR
-    before = bytes(self._memory)
-    self._memory[address : address + len(data)] = data
-    limits = {
-      self.table.goal_current: self._get(self.table.current_limit),
-      self.table.velocity: self._get(self.table.velocity_limit),
-      self.table.acceleration: self._get(self.table.acceleration_limit),
-      self.table.goal_position: 1150,
-    }
-    if any(self._get(field) > limit for field, limit in limits.items()):
-      self._memory[:] = before
-      return _LIMIT_ERROR
-    return 0
-
-  def _status(self, error: int, data: bytes | bytearray = b"") -> bytes:
+  def _status(self, error: int, data: bytes = b"") -> bytes:
     alert = _ALERT if self._get(self.table.hardware_error) else 0
     body = bytes([_STATUS, error | alert]) + data
     body = body.replace(b"\xff\xff\xfd", b"\xff\xff\xfd\xfd")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import contextlib
+import functools
 import json
 from multiprocessing.connection import Connection
 import selectors
@@ -16,6 +17,7 @@ import time
 from typing import Any
 
 from apnpql_jax.errors import DeviceError
+from apnpql_jax.robot.doubles import modbus
 from apnpql_jax.robot.doubles.controller import VERSION, Controller
 from apnpql_jax.robot.doubles.dynamixel import Gripper, open_terminal
 from apnpql_jax.robot.doubles.plant import STEP, Plant
@@ -233,7 +235,10 @@ def main(pipe: Connection) -> None:
   gripper = Gripper(
     TABLES[settings["gripper"]], plant, model_number=settings["model_number"]
   )
-  terminal, descriptor, read = open_terminal(gripper.receive)
+  speak = functools.partial(modbus.answer, gripper)
+  terminal, descriptor, read = open_terminal(
+    speak if settings["modbus"] else gripper.receive
+  )
   server.watch(descriptor, read)
   server.listen(REMOTE, b"", Remote(plant, controller, gripper, server).answer)
   server.watch(pipe, pipe.recv)  # Raises EOFError when the parent ends.

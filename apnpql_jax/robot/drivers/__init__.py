@@ -17,7 +17,7 @@ def vendor(module: str, package: str) -> Any:
   try:
     return importlib.import_module(module)
   except ImportError as error:
-    lacks = "" if error.name == module else f" ({error})"
+    lacks = "" if error.name in (module, module.split(".")[0]) else f" ({error})"
     raise DeviceError(
       f"robot needs {package}{lacks}: pip install 'apnpql-jax[robot]'"
     ) from error

@@ -1,22 +1,19 @@
-"""The grippers RH-P12-RN and RH-P12-RN(A), by ``dynamixel-sdk`` (protocol 2.0).
+"""The grippers RH-P12-RN and RH-P12-RN(A), by Dynamixel protocol 2.0 or Modbus-RTU.
 
 The bus is slow (one reading takes about 10 ms at 57,600 baud), so a thread reads the
 finger's angle and writes commands. While the fingers move, it adapts their velocity to
-their angle, so that the gap changes at the constant speed of the training. Modbus-RTU,
-to which an RH-P12-RN(A) can be switched, is not supported: switch Protocol Type(13)
-back to 2.
+their angle, so that the gap changes at the constant speed of the training.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import math
 import threading
 import time
 from typing import Any
 
 from apnpql_jax.errors import DeviceError, one_line
-from apnpql_jax.robot.drivers import vendor
+from apnpql_jax.robot.drivers import buses
 from apnpql_jax.robot.drivers.rh_p12_rn import (
   CLOSED,
   ERRORS,
@@ -36,7 +33,6 @@ BAUD = 57600  # the factory setting
 CURRENT_SHARE = GRIPPER_TORQUE / torque(1.0)
 """Share of the largest current whose torque is about that of the training."""
 
-_PATIENCE = 0.5  # s without an answer before the gripper counts as lost
 _PERIOD = 0.005  # s between two readings at least
 _ERROR_PERIOD = 0.5  # s between two readings of the hardware error status
 _REVOLUTION = 2 * math.pi / 60  # rad/s per rev/min
@@ -74,9 +70,7 @@ class RHP12RN:
     """
     self._where, self._baud, self._id = port, baud, device_id
     self._share = current_share
-    self._sdk: Any = None
-    self._port: Any = None
-    self._packets: Any = None
+    self._bus: buses.Bus | None = None
     self._table: Table | None = None
     self._about: dict[str, Any] = {}
     self._thread: threading.Thread | None = None
@@ -93,19 +87,13 @@ class RHP12RN:
     """
     if self._thread:
       return
-    self._sdk = sdk = vendor("dynamixel_sdk", "dynamixel-sdk")
-    self._port, self._packets = sdk.PortHandler(self._where), sdk.PacketHandler(2.0)
-    try:
-      self._port.setBaudRate(self._baud)  # Opens the port.
-    except Exception as error:  # Those of pyserial, and of termios.
-      raise DeviceError(f"gripper: {one_line(error)}") from None
     self._goal, self._error = None, ""
     try:
-      self._table = self._identify()
+      self._bus, self._table = self._identify()
       self._prepare(self._table)
       self._state = self._read_state()
     except DeviceError as error:
-      self._port.closePort()
+      self._close()
       raise DeviceError(f"gripper: {error}") from None
     self._ending.clear()
     self._thread = threading.Thread(target=self._serve, daemon=True)
@@ -115,9 +103,9 @@ class RHP12RN:
     """See ``protocols.Device``; the fingers hold what they hold."""
     self._ending.set()
     if self._thread:
-      self._thread.join(4 * _PATIENCE)
+      self._thread.join(2.0)
       self._thread = None
-      self._port.closePort()
+    self._close()
 
   def describe(self) -> dict[str, Any]:
     """See ``protocols.Device``; the gripper has no serial number to read."""
@@ -148,20 +136,37 @@ class RHP12RN:
     if self._thread is None:
       raise DeviceError(f"gripper: {self._where} is not connected")
 
-  def _identify(self) -> Table:
+  def _identify(self) -> tuple[buses.Bus, Table]:
+    """Returns the bus on which a gripper answers, and its control table."""
+    bus: buses.Bus = buses.Dynamixel(self._where, self._baud, self._id)
     try:
-      number, *_ = self._try(self._packets.ping)
-    except DeviceError:
+      return bus, self._table_of(bus)
+    except buses.Silent:
+      bus.close()
+    try:
+      bus = buses.Modbus(self._where, self._baud, self._id)
+      return bus, self._table_of(bus)
+    except buses.Silent:
+      bus.close()
       raise DeviceError(
-        f"nothing answers at {self._where}, ID {self._id}, {self._baud} baud: "
-        "check power, cable, ID, baud rate and Protocol Type"
+        f"nothing answers at {self._where}, ID {self._id}, {self._baud} baud, neither "
+        "by Dynamixel 2.0 nor by Modbus-RTU: check power, cable, ID and baud rate"
       ) from None
+
+  def _table_of(self, bus: buses.Bus) -> Table:
+    number = int.from_bytes(bus.read(0, 2), "little")
     if number not in TABLES:
+      bus.close()
       names = " or ".join(f"{x.name} ({x.model_number})" for x in TABLES.values())
       raise DeviceError(
         f"the device at {self._where} has model number {number}, not {names}"
       )
     return TABLES[number]
+
+  def _close(self) -> None:
+    bus, self._bus = self._bus, None
+    if bus:
+      bus.close()
 
   def _prepare(self, table: Table) -> None:
     """Sets mode, current and acceleration; the fingers stay where they are."""
@@ -179,6 +184,7 @@ class RHP12RN:
       "model": table.name,
       "model_number": table.model_number,
       "firmware": self._read(table.firmware),
+      "bus": self._open_bus().name,
       "id": self._id,
       "current_ma": current * table.milliamperes,
     }
@@ -215,7 +221,7 @@ class RHP12RN:
     pair = {self._table.goal_position: goal, self._table.velocity: velocity}
     fields = sorted(pair, key=lambda field: field.address)
     data = b"".join(pair[x].to_bytes(x.size, "little") for x in fields)
-    self._send(fields[0].address, data)
+    self._open_bus().write(fields[0].address, data)
 
   def _read_state(self) -> GripperState:
     assert self._table
@@ -233,24 +239,11 @@ class RHP12RN:
       )
 
   def _read(self, field: Field) -> int:
-    data, *_ = self._try(self._packets.readTxRx, field.address, field.size)
-    return int.from_bytes(bytes(data), "little")
+    return int.from_bytes(self._open_bus().read(field.address, field.size), "little")
 
   def _write(self, field: Field, value: int) -> None:
-    self._send(field.address, value.to_bytes(field.size, "little"))
+    self._open_bus().write(field.address, value.to_bytes(field.size, "little"))
 
-  def _send(self, address: int, data: bytes) -> None:
-    *_, error = self._try(self._packets.writeTxRx, address, len(data), list(data))
-    if error & 0x7F:  # Bit 7 tells of a hardware error, which has its own reading.
-      reason = one_line(Exception(self._packets.getRxPacketError(error & 0x7F)))
-      raise DeviceError(f"{self._where}: it refuses to write {address}: {reason}")
-
-  def _try(self, call: Callable[..., tuple], *args: Any) -> tuple:
-    """Returns what a call of the SDK returns, (..., result, error); tries again."""
-    end = time.monotonic() + _PATIENCE
-    while time.monotonic() < end:
-      answer = call(self._port, self._id, *args)
-      if answer[-2] == self._sdk.COMM_SUCCESS:
-        return answer
-      self._port.clearPort()
-    raise DeviceError(f"{self._where}: it does not answer: check its power and cable")
+  def _open_bus(self) -> buses.Bus:
+    assert self._bus
+    return self._bus

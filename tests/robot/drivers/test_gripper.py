@@ -19,6 +19,7 @@ from apnpql_jax.config import files
 from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot import doubles
 from apnpql_jax.robot.doubles.dynamixel import crc
+from apnpql_jax.robot.doubles.modbus import crc as modbus_crc
 from apnpql_jax.robot.doubles.server import ask
 from apnpql_jax.robot.drivers import gripper as driver
 from apnpql_jax.robot.drivers.rh_p12_rn import CLOSED, OPEN, TICK, finger_speed, pad_gap
@@ -57,17 +58,24 @@ def settle(gripper: driver.RHP12RN, angle: float, seconds: float = 6.0) -> list:
   return log
 
 
-@pytest.mark.parametrize("number", MODELS)
-def test_the_model_is_identified_and_opens_and_closes(number):
-  with bench(gripper=number) as (host, port), held(port) as gripper:
+@pytest.mark.parametrize(
+  ("number", "bus"),
+  [(35073, "Dynamixel 2.0"), (35074, "Dynamixel 2.0"), (35074, "Modbus-RTU")],
+)
+def test_the_model_is_identified_and_opens_and_closes(number, bus):
+  if modbus := bus == "Modbus-RTU":
+    pytest.importorskip("pymodbus", reason="needs pymodbus")
+  with bench(gripper=number, modbus=modbus) as (host, port), held(port) as gripper:
     about = gripper.describe()
-    assert (about["model"], about["model_number"]) == (MODELS[number], number)
+    found = about["model"], about["model_number"], about["bus"]
+    assert found == (MODELS[number], number, bus)
     for close, angle in ((False, 0.0), (True, 1.1), (False, 0.0)):
       gripper.send_action(close)
       gripper.send_action(close)  # Changes nothing.
       settle(gripper, angle)
+      time.sleep(0.5)  # Now it stands still.
       truth = ask(host, "state")["finger"]
-      assert gripper.get_observation().angle == pytest.approx(truth, abs=0.01)
+      assert gripper.get_observation().angle == pytest.approx(truth, abs=2 * TICK)
 
 
 def test_the_gap_closes_at_the_speed_of_the_training():
@@ -75,7 +83,7 @@ def test_the_gap_closes_at_the_speed_of_the_training():
     gripper.send_action(False)
     settle(gripper, 0.0)
     gripper.send_action(True)
-    times, angles = np.transpose(settle(gripper, 1.09))
+    times, angles = np.transpose(settle(gripper, 1.1))
   gaps = np.array([pad_gap(angle) for angle in angles])
   inner = (gaps < 0.09) & (gaps > 0.015)  # After the ramp of the profile.
   speed = -np.polyfit(times[inner], gaps[inner], 1)[0]
@@ -138,8 +146,11 @@ def test_gap_and_speed_are_those_of_the_linkage(angle):
   assert -slope * finger_speed(angle) == pytest.approx(0.075, rel=0.01)
 
 
-def test_a_silent_gripper_is_one_line_in_time():
-  with bench() as (host, port), held(port) as gripper:
+@pytest.mark.parametrize("modbus", [False, True])
+def test_a_silent_gripper_is_one_line_in_time(modbus):
+  if modbus:
+    pytest.importorskip("pymodbus", reason="needs pymodbus")
+  with bench(modbus=modbus) as (host, port), held(port) as gripper:
     ask(host, "silence_gripper")
     begin = time.monotonic()
     with pytest.raises(DeviceError, match="does not answer: check its power") as error:
@@ -199,9 +210,10 @@ def test_a_missing_port_or_package_is_one_line(monkeypatch):
     driver.connect("/dev/nothing")
 
 
-def test_the_checksum_is_that_of_the_sdk():
+def test_the_checksums_are_those_of_the_protocols():
   rng = np.random.default_rng(0)
   for size in (1, 8, 40):
     data = rng.integers(0, 256, size).tolist()
     assert crc(bytes(data)) == sdk.PacketHandler(2.0).updateCRC(0, data, size)
+  assert modbus_crc(b"123456789") == 0x4B37  # The check value of CRC-16/MODBUS.
   assert math.isclose(TICK, 0.0015339807878856412)  # ``rh_p12_rn.model`` of ROBOTIS
