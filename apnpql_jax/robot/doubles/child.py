@@ -88,3 +88,4 @@ def run(module: str, descriptor: int) -> None:
       pipe.send(error)
     except Exception as error:
       pipe.send(ConfigError(f"a double does not start: {one_line(error)}"))
+      raise

@@ -129,6 +129,26 @@ def test_the_fingers_lift_an_object():
   assert plant.wrench[2] == pytest.approx(-9.81 * mass, abs=1.0)
 
 
+def test_the_plant_follows_with_the_lag_of_servo_j():
+  plant = Plant("push_plate", noise=False)
+  start, swing = plant.position, np.array([0.3, 0.1, -0.1, 0.2, -0.2, 0.3])
+  times = np.arange(0, 3, STEP)
+  targets = start + swing * np.sin(times[:, None]) ** 2
+  for lookahead, gain, lag in ((0.03, 300, 0.03), (0.1, 300, 0.1), (0.03, 150, 0.06)):
+    real = []
+    for target in targets:
+      plant.servo(target, lookahead, gain)
+      assert not plant.step()
+      real.append(plant.position)
+    delays = np.arange(0.0, 0.2, STEP)
+    for joint in range(6):
+      late = [np.interp(times - d, times, targets[:, joint]) for d in delays]
+      errors = [np.abs(x - np.array(real)[:, joint])[500:].mean() for x in late]
+      best = delays[int(np.argmin(errors))]
+      assert best == pytest.approx(lag, abs=3 * STEP)
+      assert min(errors) < 0.01 * abs(swing[joint])
+
+
 def test_other_bytes_than_rtde_are_refused():
   session = Session((5, 25, 0, 0), lambda _: None)
   with pytest.raises(ValueError, match="not RTDE"):
