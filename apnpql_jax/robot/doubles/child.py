@@ -40,6 +40,7 @@ class Child:
       pass_fds=[theirs.fileno()],
       env={**os.environ, "PYTHONPATH": path},
       stdin=subprocess.DEVNULL,
+      start_new_session=True,  # Ctrl-C is for the program that has to stop the arm.
     )
     theirs.close()
     try:

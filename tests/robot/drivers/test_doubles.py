@@ -93,6 +93,38 @@ def test_the_processes_end_with_their_parent():
     ask(host, "state")
 
 
+def test_ctrl_c_does_not_end_them():
+  code = """
+import os, signal, time
+from apnpql_jax.robot import doubles
+from apnpql_jax.robot.doubles.server import ask
+server = doubles.serve("push_plate")
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+os.killpg(0, signal.SIGINT)
+time.sleep(0.5)
+ask(server.greeting[0], "state")
+server.close()
+"""
+  subprocess.run(
+    [sys.executable, "-c", code], check=True, start_new_session=True, timeout=60
+  )
+
+
+def test_payload_of_the_rig_is_that_of_the_scene():
+  plant = Plant("push_plate", noise=False)
+  tool = plant.model.body("gripper").id
+  assert plant.model.body_subtreemass[tool] == pytest.approx(doubles.PAYLOAD_KG)
+  plant.zero_wrench()
+  plant.set_payload(doubles.PAYLOAD_KG, np.array(doubles.PAYLOAD_COG_M))
+  plant.step()
+  plant.zero_wrench()
+  plant.servo(plant.position + [0, 0, 0, 0, 1.0, 0], 0.03, 300)
+  for _ in range(1000):
+    plant.step()
+  assert np.abs(plant.wrench[:3]).max() < 0.01  # N
+  assert np.abs(plant.wrench[3:]).max() < 0.05  # N m; the fingers move their center
+
+
 def test_drivers_and_doubles_import_no_jax():
   code = (
     "import sys; from apnpql_jax.robot import doubles; "
