@@ -404,7 +404,7 @@ def test_prior_keeps_its_floors_and_limits():
 def test_without_an_offset_the_gripper_is_that_of_the_primitives():
   rng = np.random.default_rng(4)
   outputs, primitives = rng.normal(size=(20, 3 * 23)), rng.normal(size=(20, 3, 7))
-  limits = {"min_std": 0.05, "initial_std": 0.2, "max_std": 0.5, "min_prob": 0.2}
+  limits: Any = {"min_std": 0.05, "initial_std": 0.2, "max_std": 0.5, "min_prob": 0.2}
   given = [jnp.asarray(3.0 * x, jnp.float32) for x in (outputs, primitives)]
   with_offset, without = (
     mixture_from_outputs(*given, num=3, gripper_offset=offset, **limits)
