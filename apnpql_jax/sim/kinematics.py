@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 from flax import struct
 import jax
-from mujoco import mjx
 
 from apnpql_jax.sim.mjx_patches import patch_mjx
 from apnpql_jax.sim.physics import PhysicsState, model_fields
+from apnpql_jax.sim.quiet_mjx import mjx
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import mujoco
-from mujoco import mjx
 import numpy as np
 
 from apnpql_jax.sim import motors, physics
 from apnpql_jax.sim.mjx_patches import patch_mjx
 from apnpql_jax.sim.physics import STATE_FIELDS, PhysicsState
+from apnpql_jax.sim.quiet_mjx import mjx
 from apnpql_jax.sim.scene import Scene, free_joints
 from apnpql_jax.types import Array
 

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from mujoco import mjx
-from mujoco.mjx._src import scan as _scan, solver as _solver
 import numpy as np
+
+from apnpql_jax.sim.quiet_mjx import mjx
+
+_scan, _solver = mjx._src.scan, mjx._src.solver
 
 
 def patch_mjx() -> None:

@@ -13,13 +13,13 @@ import pathlib
 import warnings
 
 import mujoco
-from mujoco import mjx
 import numpy as np
 
 from apnpql_jax.config import files
 from apnpql_jax.console import print_line
 from apnpql_jax.errors import ConfigError, one_line
 from apnpql_jax.sim import scene_checks
+from apnpql_jax.sim.quiet_mjx import mjx
 
 ARM_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 GRIPPER_JOINT = "finger_r1"

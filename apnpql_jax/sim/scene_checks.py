@@ -10,11 +10,11 @@ import functools
 from typing import Any
 
 import mujoco
-from mujoco import mjx
 import numpy as np
 
 from apnpql_jax.config.files import mjcf_path
 from apnpql_jax.errors import ConfigError
+from apnpql_jax.sim.quiet_mjx import mjx
 
 _FIXED = {
   "joint": (

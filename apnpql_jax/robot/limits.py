@@ -1,0 +1,165 @@
+"""Limits of the motion that hold whatever the policy does.
+
+Every 2 ms a ``MotionLimiter`` turns a proposed joint velocity into the position that
+the arm is to have next. Its state always leaves a way to stop inside of the boxes: the
+next velocity is accepted only if braking from it ends inside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import dataclasses
+
+import numpy as np
+
+from apnpql_jax.sim.motors import MAX_ACCELERATION, MAX_VELOCITY
+
+TIMESTEP = 0.002
+"""Cycle of the controller, s: 500 Hz, as the arm's."""
+
+BRAKING = 4.0
+"""Deceleration after a fault, and largest acceleration in contact, rad/s^2.
+
+Training's 1.2 rad/s^2 would take 0.83 s from 1 rad/s. This takes 0.25 s, which leaves
+as much for detection and for the lag of the arm.
+"""
+
+DEVIATION = 0.05
+"""Largest distance of a commanded joint angle from the measured one, rad."""
+
+MARGIN = 0.002
+"""Distance from the workspace box that is kept, m; above the error of its samples."""
+
+_WAY = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""Parts of a braking distance at which the tool must be inside the workspace box."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+  """The limits of a cell; the defaults are those of the training or of the arm."""
+
+  box: np.ndarray
+  """Workspace of the tool in the world, f64[3, 2]: lowest and highest x, y, z in m."""
+
+  joints: np.ndarray
+  """Lowest and highest joint angles f64[6, 2], rad."""
+
+  velocity: float = MAX_VELOCITY
+  """Joint velocity, rad/s."""
+
+  acceleration: float = MAX_ACCELERATION
+  """Joint acceleration in free motion, rad/s^2."""
+
+  braking: float = BRAKING
+  """Joint deceleration after a fault, rad/s^2."""
+
+  deviation: float = DEVIATION
+  """Distance of a commanded joint angle from the measured one, rad."""
+
+  hold_force: float = 30.0
+  """Force on the tool at which the arm holds, N."""
+
+  stop_force: float = 50.0
+  """Force on the tool at which the arm stops, N."""
+
+  frame_age: float = 0.1
+  """Age of a frame, when its action is chosen, from which the arm holds, s."""
+
+  joint_age: float = 0.02
+  """Age of the measured joints from which the arm stops, s."""
+
+  period: float = 0.15
+  """Control period of the policy, s. One period late the arm holds, two it stops."""
+
+
+class MotionLimiter:
+  """A commanded state that moves within the limits."""
+
+  def __init__(
+    self, limits: Limits, tool_position: Callable[[np.ndarray], np.ndarray]
+  ) -> None:
+    """Keeps the limits; ``tool_position`` maps joint angles to m in the world."""
+    self.limits, self._tool = limits, tool_position
+    self.position, self.velocity = np.zeros(6), np.zeros(6)
+    self._low, self._high = limits.box.T + np.array([[MARGIN], [-MARGIN]])
+
+  def start(self, position: np.ndarray) -> str:
+    """Begins at rest; returns why the arm must not move there, or an empty string."""
+    self.position, self.velocity = np.array(position, float), np.zeros(6)
+    low, high = self.limits.joints.T
+    outside = np.flatnonzero((self.position < low) | (self.position > high))
+    if not np.isfinite(self.position).all() or len(outside):
+      return f"joint {', '.join(map(str, outside + 1))} is outside its range"
+    tool = self._tool(self.position)
+    if (tool < self._low).any() or (tool > self._high).any():
+      place = ", ".join(f"{x:.3f}" for x in tool)
+      return f"the tool at ({place}) m is outside the workspace box"
+    return ""
+
+  def step(
+    self, velocity: np.ndarray, measured: np.ndarray, *, yielding: bool = False
+  ) -> np.ndarray:
+    """Returns the next commanded joint angles f64[6].
+
+    Args:
+      velocity: Proposed joint velocities f64[6], rad/s; brakes if not finite.
+      measured: Joint angles of the arm f64[6], which the command stays close to. This
+        may take more than the acceleration limit, but never more than the velocity.
+      yielding: The motion gives way to a contact, with up to ``braking``.
+    """
+    if not np.isfinite(velocity).all():
+      return self.brake(measured)
+    limits = self.limits
+    most = TIMESTEP * (limits.braking if yielding else limits.acceleration)
+    chosen = velocity.clip(-limits.velocity, limits.velocity)
+    chosen = chosen.clip(self.velocity - most, self.velocity + most)
+    chosen = self._within_joints(chosen)
+    if not self._can_stop(chosen):
+      chosen = self._within_joints(self._slower(limits.acceleration))
+    return self._advance(chosen, measured)
+
+  def brake(self, measured: np.ndarray) -> np.ndarray:
+    """Returns the next commanded joint angles f64[6], on the way to rest."""
+    slower = self._slower(self.limits.braking)
+    return self._advance(self._within_joints(slower), measured)
+
+  @property
+  def at_rest(self) -> bool:
+    """Whether the command stands still."""
+    return not self.velocity.any()
+
+  def _slower(self, deceleration: float) -> np.ndarray:
+    """Returns the velocity after a cycle of braking on a straight line of joints."""
+    fastest = np.abs(self.velocity).max()
+    return self.velocity * max(0.0, 1 - deceleration * TIMESTEP / max(fastest, 1e-9))
+
+  def _within_joints(self, velocity: np.ndarray) -> np.ndarray:
+    """Returns a velocity from which each joint can stop inside its range."""
+    low, high = self.limits.joints.T
+    slowing = self.limits.acceleration
+    step = slowing * TIMESTEP
+    # The solution v of h v + v^2 / (2 a) = room, so that a further cycle exists.
+    up, down = (
+      np.sqrt(step**2 + 2 * slowing * room.clip(0.0)) - step
+      for room in (high - self.position, self.position - low)
+    )
+    return velocity.clip(-down, up)
+
+  def _can_stop(self, velocity: np.ndarray) -> bool:
+    """Returns whether braking after a cycle with ``velocity`` stays in the box."""
+    after = self.position + TIMESTEP * velocity
+    way = velocity * np.abs(velocity).max() / (2 * self.limits.acceleration)
+    for part in _WAY:
+      tool = self._tool(after + part * way)
+      if (tool < self._low).any() or (tool > self._high).any():
+        return False
+    return True
+
+  def _advance(self, velocity: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    if np.isfinite(measured).all():
+      gap, most = measured - self.position, self.limits.deviation
+      velocity = velocity.clip((gap - most) / TIMESTEP, (gap + most) / TIMESTEP)
+      velocity = velocity.clip(-self.limits.velocity, self.limits.velocity)
+    self.position = self.position + TIMESTEP * velocity
+    self.velocity = velocity
+    return self.position.copy()

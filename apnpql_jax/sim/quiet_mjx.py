@@ -1,0 +1,6 @@
+"""MJX; the only module that may import it, because that prints about optional Warp."""
+
+from apnpql_jax import runtime
+
+with runtime.quiet_warp():
+  from mujoco import mjx  # noqa: F401 - for the other modules

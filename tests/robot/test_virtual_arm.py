@@ -1,0 +1,72 @@
+"""The virtual arm moves as training's arm, and answers contacts as predicted."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from apnpql_jax.config.files import mjcf_path
+from apnpql_jax.robot.virtual_arm import Admittance, VirtualArm
+from apnpql_jax.sim import motors
+
+NEUTRAL = np.array([-1.8957, -1.7712, 1.9888, -1.7884, -1.5708, -0.3249])
+PERIODS = 20
+
+
+def trained(actions: np.ndarray) -> np.ndarray:
+  """Returns joint angles after each period of 0.15 s of training's arm, in C MuJoCo."""
+  model = mujoco.MjModel.from_xml_path(str(mjcf_path("push_plate")))
+  data = mujoco.MjData(model)
+  data.qpos[:] = model.keyframe("neutral").qpos
+  limit, found = model.actuator_ctrlrange[:6, 1], []
+  for action in actions:
+    for _ in range(30):
+      mujoco.mj_forward(model, data)
+      mass = np.zeros((model.nv, model.nv))
+      mujoco.mj_fullM(model, data, mass)
+      bias, velocity = data.qfrc_bias[:6], data.qvel[:6]
+      data.ctrl[:6] = motors.arm_torque(mass[:6, :6], bias, velocity, action[:6], limit)
+      data.ctrl[6] = motors.gripper_torque(data.qpos[6], data.qvel[6], 1.0, np)
+      mujoco.mj_step(model, data)
+    found.append(data.qpos[:6].copy())
+  return np.array(found)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_moves_as_in_training(seed):
+  actions = np.random.default_rng(seed).uniform(-1, 1, (PERIODS, 6))
+  arm, found = VirtualArm(), []
+  arm.reset(NEUTRAL)
+  for action in actions:
+    for _ in range(75):
+      arm.step(action)
+    found.append(arm.position)
+  error = np.abs(np.array(found) - trained(actions)).max()
+  print(error)
+  assert error <= 1e-3
+  assert np.abs(found[-1] - NEUTRAL).max() > 0.1
+
+
+def test_small_forces_and_no_admittance_change_nothing():
+  for admittance, force in ((Admittance(), 4.9), (None, 40.0)):
+    arm = VirtualArm(admittance=admittance)
+    arm.reset(NEUTRAL)
+    for _ in range(500):
+      arm.step(np.zeros(6), NEUTRAL, np.array([0, 0, force, 0, 0, 0.4]))
+    np.testing.assert_allclose(arm.position, NEUTRAL, atol=1e-6)
+    assert not arm.contact
+
+
+def test_gives_way_along_the_force():
+  arm = VirtualArm(admittance=Admittance())
+  arm.reset(NEUTRAL)
+  before = arm.model.tool_position(NEUTRAL)
+  push = np.zeros(6)
+  push[:3] = arm.model.base_mat.T @ [0.0, 20.0, 0.0]  # Along +y of the world.
+  for _ in range(100):
+    arm.step(np.zeros(6), None, push)
+  moved = arm.model.tool_position(arm.position) - before
+  assert moved[1] > 1e-3 and np.abs(moved[[0, 2]]).max() < moved[1] / 2
+  # 15 N beyond the dead zone against the damping D_c move it by F / D_c per second.
+  assert moved[1] < 0.2 * 15 / Admittance().damping
