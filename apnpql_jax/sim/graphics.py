@@ -47,12 +47,15 @@ class View:
     ConfigError: No graphics library can be loaded.
   """
 
-  def __init__(self, model: mujoco.MjModel, height: int, width: int):
+  def __init__(
+    self, model: mujoco.MjModel, height: int, width: int, *, shadows: bool = True
+  ):
     """Prepares images of a size; sets the model's size of off-screen buffers."""
     model.vis.global_.offheight, model.vis.global_.offwidth = height, width
     self._model, self._size = model, (height, width)
     self._gl = off_screen(width, height)
     self._scene = mujoco.MjvScene(model, model.ngeom + 64)
+    self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
     self._option = mujoco.MjvOption()
     self._option.sitegroup[:] = 0
     self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)

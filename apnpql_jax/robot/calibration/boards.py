@@ -204,4 +204,3 @@ def _charuco(board: Board) -> Any:
 @functools.cache
 def _detector(board: Board) -> Any:
   return opencv().aruco.CharucoDetector(_charuco(board))
-

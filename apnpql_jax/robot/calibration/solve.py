@@ -246,8 +246,8 @@ def _refine(
 def _check_scale(problem: Problem, camera: np.ndarray, board: np.ndarray) -> None:
   """Checks the size of the board against the motion of the arm."""
   _, _, found = _refine(problem, camera, board, scaled=True)
-  scale = 1.0 + found.x[-1]
-  if abs(scale - 1.0) > LARGEST_SCALE_ERROR:
+  scale, deviation = 1.0 + found.x[-1], _deviations(found)[-1]
+  if abs(scale - 1.0) > max(LARGEST_SCALE_ERROR, 3 * deviation):
     raise ConfigError(
       f"by the motion of the arm, the board's squares measure "
       f"{scale * problem.board.square_mm:.2f} mm, not {problem.board.square_mm:g}: "
@@ -260,9 +260,7 @@ def _residuals(
 ) -> dict[str, Any]:
   """Returns errors on all views, on views that were held out, and uncertainties."""
   _, _, found = _refine(problem, camera, board)
-  freedom = max(1, len(found.fun) - len(found.x))
-  covariance = np.linalg.pinv(found.jac.T @ found.jac) * 2 * found.cost / freedom
-  deviation = np.sqrt(np.diag(covariance)[:6])
+  deviation = _deviations(found)
   rows, held_out = np.arange(len(poses)), []
   for fold in range(_FOLDS):
     test = rows % _FOLDS == fold
@@ -274,8 +272,15 @@ def _residuals(
       for name in held_out[0]
     },
     "deviation_mm": float(1e3 * np.linalg.norm(deviation[:3])),
-    "deviation_deg": float(np.degrees(np.linalg.norm(deviation[3:]))),
+    "deviation_deg": float(np.degrees(np.linalg.norm(deviation[3:6]))),
   }
+
+
+def _deviations(found: Any) -> np.ndarray:
+  """Returns the standard deviations of the unknowns that scipy solved for."""
+  freedom = max(1, len(found.fun) - len(found.x))
+  covariance = np.linalg.pinv(found.jac.T @ found.jac) * 2 * found.cost / freedom
+  return np.sqrt(np.diag(covariance))
 
 
 def _consistency(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 import contextlib
 import dataclasses
 import json
@@ -24,7 +24,7 @@ from apnpql_jax.robot.calibration.boards import Board, _charuco
 from apnpql_jax.robot.calibration.lenses import Lens
 from apnpql_jax.sim.graphics import View
 
-HEIGHT, WIDTH = 720, 1280
+HEIGHT, WIDTH = 540, 960
 NEUTRAL = np.array([-1.6, -1.7, 2.2, -2.1, -1.57, 0.0])
 FLIP = np.diag([1.0, -1.0, -1.0])  # OpenGL's camera axes to OpenCV's
 THICKNESS = 0.004
@@ -79,7 +79,7 @@ class Studio:
   def photo(
     self, name: str, rng: np.random.Generator, distortion: Sequence[float] = ()
   ) -> np.ndarray:
-    """Returns a photo with blur and noise, and with a distorting lens if one is given."""
+    """Returns a photo with blur and noise, and with distortion if one is given."""
     image = self.view.draw(self.data, name)
     if distortion:
       lens = self.lens(name, distortion)
@@ -113,12 +113,10 @@ class Studio:
 
 
 @contextlib.contextmanager
-def studio(board: Board, *, on_tool: bool, scale: float = 1.0) -> Iterator[Studio]:
+def studio(board: Board, *, on_tool: bool, scale: float = 1.0) -> Generator[Studio]:
   """Makes the scene; ``scale`` is that of a printer that does not print at 100 %."""
   included = dict(files.mjcf_files())
-  spec = mujoco.MjSpec.from_string(
-    included["arena.xml"].decode(), include=included
-  )
+  spec = mujoco.MjSpec.from_string(included["arena.xml"].decode(), include=included)
   pixels = _charuco(board).generateImage((board.columns * 100, board.rows * 100))
   margin = 20
   pixels = np.pad(pixels, margin, constant_values=255)
@@ -135,9 +133,10 @@ def studio(board: Board, *, on_tool: bool, scale: float = 1.0) -> Iterator[Studi
   )
   material = spec.add_material(name="board", specular=0.1)
   material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "board"
-  # The board's frame is x right, y down, z into it, with the origin at its first corner.
+  # The board's frame is x right, y down, z into it; its origin is the first corner.
   edge = grow * margin
-  corners = np.array([[x, y, z] for z in (0, THICKNESS) for y in (0, 1) for x in (0, 1)])
+  grid = [[x, y, z] for z in (0, THICKNESS) for y in (0, 1) for x in (0, 1)]
+  corners = np.array(grid)
   vertices = corners * [width, height, 1] - [edge, edge, 0]
   spec.add_mesh(
     name="board",
@@ -173,9 +172,10 @@ def studio(board: Board, *, on_tool: bool, scale: float = 1.0) -> Iterator[Studi
   model = spec.compile()
   start = model.tex_adr[model.texture("board").id]
   model.tex_data[start : start + 3 * pixels.size] = np.repeat(pixels, 3)
+  model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.3, 0.1
   model.vis.quality.offsamples = 4
   try:
-    view = View(model, HEIGHT, WIDTH)
+    view = View(model, HEIGHT, WIDTH, shadows=False)
   except ConfigError as error:
     if "needs EGL or OSMesa" not in str(error):
       raise
