@@ -16,7 +16,7 @@ FEWEST_VIEWS = 8  # from which a lens is estimated
 
 @dataclasses.dataclass(frozen=True)
 class Lens:
-  """Intrinsics in pixels of an image of this size; OpenCV's distortion model."""
+  """Intrinsics in pixels of images of this size; the first pixel's center is 0, 0."""
 
   height: int
   width: int
@@ -25,6 +25,7 @@ class Lens:
   cx: float
   cy: float
   distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+  """k1, k2, p1, p2, k3 of OpenCV."""
 
   @property
   def matrix(self) -> np.ndarray:
@@ -73,17 +74,8 @@ class Lens:
         "a lens needs height, width, fx, fy, cx, cy and distortion, all numbers"
       ) from None
     numbers = [lens.fx, lens.fy, lens.cx, lens.cy, *distortion]
-    possible = min(lens.height, lens.width) > 0 and min(lens.fx, lens.fy) > 0
-    if (
-      not possible
-      or not all(map(math.isfinite, numbers))
-      or len(distortion)
-      not in (
-        4,
-        5,
-        8,
-      )
-    ):
+    possible = min(lens.height, lens.width, lens.fx, lens.fy) > 0
+    if not possible or len(distortion) != 5 or not all(map(math.isfinite, numbers)):
       raise ConfigError("a lens has impossible numbers")
     return lens
 

@@ -112,15 +112,18 @@ def record(
     ask: Shows a text and returns what the user types: nothing for a view, d when done.
 
   Raises:
+    ConfigError: The camera is simulated.
     DeviceError: A device fails, or the arm does not come to rest.
     FileError: The folder exists, or cannot be written.
   """
   from PIL import Image
 
+  if not hasattr(camera, "get_native"):
+    raise ConfigError(f"the {folder.name} camera gives no images of its sensor")
   if folder.exists():
     raise FileError(f"{folder} exists; name another folder for new views")
   folder.mkdir(parents=True)
-  about = {"serial": str(camera.describe()["serial"]), "lens": camera.lens()}
+  about = {"serial": str(camera.describe()["serial_number"]), "lens": camera.lens()}
   (folder / CAMERA).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
   count = 0
   while True:

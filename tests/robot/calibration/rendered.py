@@ -165,6 +165,7 @@ def studio(board: Board, *, on_tool: bool, scale: float = 1.0) -> Generator[Stud
     type=mujoco.mjtGeom.mjGEOM_MESH,
     meshname="board",
     material="board",
+    rgba=[1, 1, 1, 1],
     contype=0,
     conaffinity=0,
     mass=0.01,

@@ -427,7 +427,7 @@ class Sensor:
     self.clock: Any = None
 
   def describe(self) -> dict[str, Any]:
-    return {"serial": "live"}
+    return {"serial_number": "live"}
 
   def lens(self) -> dict[str, Any]:
     return self._lens
@@ -472,3 +472,5 @@ def test_views_are_taken_with_connected_devices(
   assert_close(made.pose, wrist.truth)
   with pytest.raises(FileError, match="exists; name another folder for new views"):
     views.record(tmp_path / "live" / "wrist", BOARD, arm, sensor, ask=arm.move)  # ty: ignore[invalid-argument-type]
+  with pytest.raises(ConfigError, match="wrist camera gives no images of its sensor"):
+    views.record(tmp_path / "new" / "wrist", BOARD, arm, arm, ask=arm.move)  # ty: ignore[invalid-argument-type]
