@@ -11,6 +11,7 @@ from typing import Any
 import av
 import numpy as np
 
+from apnpql_jax import runtime
 from apnpql_jax.data.lerobot import layout
 from apnpql_jax.data.lerobot.layout import ACTION, COUNTERS, STATE, SUCCESS, Json
 from apnpql_jax.errors import FileError, UserError, one_line
@@ -65,7 +66,7 @@ class Episode:
           if left and frame.time > begin - 0.5 * period:
             left -= 1
             yield frame.to_ndarray(format="rgb24")
-    except OSError as error:
+    except (OSError, av.FFmpegError) as error:
       raise FileError(f"cannot read {path}: {one_line(error)}") from None
     if left:
       raise FileError(f"{path} lacks {left} of {len(self.time)} frames")
@@ -107,8 +108,6 @@ def read(folder: Path | str) -> Dataset:
 
 
 def _read(folder: Path) -> Dataset:
-  import pyarrow.parquet as pq
-
   info = json.loads((folder / layout.INFO).read_text(encoding="utf-8"))
   if info["codebase_version"] != layout.VERSION:
     raise FileError(
@@ -119,9 +118,11 @@ def _read(folder: Path) -> Dataset:
     if features.get(name, {}).get("shape") != [7]:
       raise FileError(f"it has no {name} of 7 numbers: six joints and the gripper")
   vectors = {
-    name: about["names"]
+    name: _names(about)
     for name, about in features.items()
-    if about["dtype"].startswith("float") and name not in COUNTERS
+    if about["dtype"].startswith("float")
+    and len(about["shape"]) == 1
+    and name not in COUNTERS
   }
   videos = [name for name, about in features.items() if about["dtype"] == "video"]
   about = folder / layout.ABOUT
@@ -133,7 +134,7 @@ def _read(folder: Path) -> Dataset:
   )
   if not info["total_episodes"]:
     return found
-  table = pq.read_table(folder / layout.TASKS)
+  table = _table(folder / layout.TASKS)
   texts = next(name for name in table.column_names if name != "task_index")
   tasks = dict(
     zip(table["task_index"].to_pylist(), table[texts].to_pylist(), strict=True)
@@ -141,7 +142,7 @@ def _read(folder: Path) -> Dataset:
   rows = [
     row
     for path in sorted((folder / "meta/episodes").glob("*/*.parquet"))
-    for row in pq.read_table(path).to_pylist()
+    for row in _table(path).to_pylist()
   ]
   files: dict[str, Any] = {}
   for row in sorted(rows, key=lambda row: row["episode_index"]):
@@ -151,7 +152,7 @@ def _read(folder: Path) -> Dataset:
       chunk_index=row["data/chunk_index"], file_index=row["data/file_index"]
     )
     if name not in files:
-      files = {name: pq.read_table(folder / name)}
+      files = {name: _table(folder / name)}
     data = files[name]
     mine = data["episode_index"].to_numpy() == row["episode_index"]
     columns = {
@@ -186,7 +187,28 @@ def _read(folder: Path) -> Dataset:
   return found
 
 
+def _table(path: Path) -> Any:
+  """Returns a table, unless it would take more than the memory of the machine."""
+  import pyarrow.parquet as pq
+
+  with pq.ParquetFile(path) as file:
+    groups = range(file.metadata.num_row_groups)
+    size = sum(file.metadata.row_group(i).total_byte_size for i in groups)
+    if size > (runtime.host_memory() or 1 << 32):
+      raise FileError(f"{path.name} takes {size} bytes, more than the memory")
+    return file.read()
+
+
+def _names(feature: Json) -> list[str]:
+  """Returns the names of a column's numbers, which may be in groups."""
+  names = feature.get("names") or []
+  return sum(names.values(), []) if isinstance(names, dict) else list(names)
+
+
 def _numbers(column: Any, rows: np.ndarray) -> np.ndarray:
-  """Returns rows of a column as f64[n, k]."""
-  values = np.array(column.to_pylist(), np.float64)[rows]
-  return values.reshape(len(values), -1)
+  """Returns rows of a column of numbers or of lists of numbers as f64[n, k]."""
+  values, count = column.combine_chunks(), len(column)
+  if hasattr(values, "flatten") and hasattr(values.type, "value_type"):
+    values = values.flatten()
+  values = values.to_numpy(zero_copy_only=False).astype(np.float64)
+  return values.reshape(count, -1)[rows]

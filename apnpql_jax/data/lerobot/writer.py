@@ -73,7 +73,7 @@ class Writer:
       if about is not None:
         self._write_json(layout.ABOUT, about)
       self._write_info()
-    except OSError as error:
+    except (OSError, av.FFmpegError) as error:
       raise self._failed(error) from None
 
   def __enter__(self) -> Writer:
@@ -108,7 +108,7 @@ class Writer:
         if name not in self._videos:
           self._videos[name] = _Video(self._part(name), self._images[name], self._fps)
         self._videos[name].add(np.asarray(frame[name]))
-    except OSError as error:
+    except (OSError, av.FFmpegError) as error:
       raise self._failed(error) from None
     for name, row in rows.items():
       self._rows.setdefault(name, []).append(row)
@@ -167,7 +167,7 @@ class Writer:
       )
       self._episodes, self._frames = self._episodes + 1, self._frames + count
       self._write_info()
-    except OSError as error:
+    except (OSError, av.FFmpegError) as error:
       raise self._failed(error) from None
     self._rows, self._videos = {}, {}
 
@@ -279,7 +279,7 @@ class Writer:
     """Returns the file of a video that is being written."""
     return self.folder / f"{name.removeprefix(layout.IMAGES)}.part.mp4"
 
-  def _failed(self, error: OSError) -> FileError:
+  def _failed(self, error: Exception) -> FileError:
     return FileError(f"cannot write {str(self.folder)!r}: {one_line(error)}")
 
 

@@ -55,6 +55,7 @@ def calibrate(
   board_on: str = "tool",
   arm: Arm | None = None,
   cameras: Mapping[str, NativeCamera] | None = None,
+  serials: Mapping[str, str] | None = None,
   ask: Callable[[str], str] = input,
   overwrite: bool = False,
 ) -> Json:
@@ -70,6 +71,7 @@ def calibrate(
       "table" where the wrist camera saw it.
     arm: With ``cameras``: take new views first, with this arm.
     cameras: Camera by its name -> the connected one.
+    serials: Camera by its name -> the serial number that its views must have.
     ask: See ``views.record``.
     overwrite: Replace an earlier calibration.
 
@@ -94,6 +96,8 @@ def calibrate(
       views.record(folder / name, kind, arm, camera, ask=ask)
   # The wrist first: it finds the board on the table.
   known = sorted(contract["cameras"], reverse=True)
+  if not known:
+    raise ConfigError("the policy sees no images, so no camera is to be calibrated")
   names = [name for name in known if (folder / name).is_dir()]
   if not names:
     wanted = " or ".join(str(folder / name) for name in known)
@@ -101,6 +105,8 @@ def calibrate(
   found: dict[str, _Found] = {}
   for name in names:
     try:
+      if serials is not None:
+        views.check_serial(folder / name, serials[name])
       found[name] = _calibrate_one(contract, name, folder / name, kind, board_on, found)
     except UserError as error:
       raise type(error)(f"{name} camera: {error}") from None

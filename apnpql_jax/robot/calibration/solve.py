@@ -28,9 +28,10 @@ LEAST_TURN_DEG = 10.0
 """How far the flange must turn about a second axis (root mean square over all pairs of
 views): from turns about one axis, the position along it does not follow."""
 
-OUTLIER_PX = 2.0  # a view's error above this, and
+OUTLIER_MRAD = 3.0  # a view's error above this, seen from the camera, and
 OUTLIER_FACTOR = 4.0  # above this many times the median, is an outlier's
 MOST_OUTLIERS = 0.4  # share of the views
+MOST_MRAD = 10.0  # median error of the views; 4 mm at a distance of 0.4 m
 LARGEST_SCALE_ERROR = 0.01  # of the printed board
 _FOLDS = 4
 _SUBSETS, _SUBSET = 40, 6  # random choices of views for the first guess
@@ -185,11 +186,11 @@ def _without_outliers(
   problem: Problem, camera: np.ndarray, board: np.ndarray, *, fixed: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
   """Refines the poses, leaves out views that contradict them, and refines again."""
-  kept = np.ones(len(problem.seen), bool)
+  kept, px_per_mrad = np.ones(len(problem.seen), bool), problem.lens.fx / 1e3
   camera, board, _ = _refine(problem, camera, board, fixed=fixed, robust=True)
   for _ in range(5):
     error = problem.error_of_views(camera, board)
-    limit = max(OUTLIER_PX, OUTLIER_FACTOR * float(np.median(error)))
+    limit = max(OUTLIER_MRAD * px_per_mrad, OUTLIER_FACTOR * float(np.median(error)))
     before, kept = kept, error < limit
     if len(kept) - kept.sum() > MOST_OUTLIERS * len(kept):
       break
@@ -198,7 +199,7 @@ def _without_outliers(
     if (kept == before).all():
       break
   median = float(np.median(problem.error_of_views(camera, board)))
-  if median > 2 * OUTLIER_PX or (~kept).mean() > MOST_OUTLIERS:
+  if median > MOST_MRAD * px_per_mrad or (~kept).mean() > MOST_OUTLIERS:
     raise ConfigError(
       f"the views contradict each other by {median:.1f} pixels (median): check that "
       "the board did not move, that joint angles belong to their images and are in "

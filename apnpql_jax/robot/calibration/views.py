@@ -59,24 +59,22 @@ class Views:
     return height, width
 
 
+def check_serial(folder: Path, serial: str) -> None:
+  """Raises ``FileError`` if the views in a folder are of another camera."""
+  found, _ = _camera(folder)
+  if found != serial:
+    raise FileError(
+      f"the views in {folder} are of {found}, but the robot has {serial}: take new ones"
+    )
+
+
 def load(folder: Path) -> Views:
   """Reads a folder of views.
 
   Raises:
     FileError: A file is missing or damaged, or an image has another size.
   """
-  try:
-    about = json.loads((folder / CAMERA).read_text(encoding="utf-8"))
-    serial, lens = str(about["serial"]), about.get("lens")
-    lens = None if lens is None else Lens.from_json(lens)
-  except OSError as error:
-    raise FileError(
-      f"cannot read {folder / CAMERA}: {error.strerror or error}"
-    ) from None
-  except (ValueError, KeyError, TypeError, AttributeError) as error:
-    raise FileError(
-      f'{folder / CAMERA} must have "serial" and may have "lens": {one_line(error)}'
-    ) from None
+  serial, lens = _camera(folder)
   paths = sorted(folder.glob("*.png"))
   if not paths:
     raise FileError(f"{folder} has no views: a PNG and a JSON file for each")
@@ -90,6 +88,22 @@ def load(folder: Path) -> Views:
         "as the camera's lens or the other views"
       )
   return Views(serial, lens, [path.stem for path in paths], joints, images)
+
+
+def _camera(folder: Path) -> tuple[str, Lens | None]:
+  """Returns the serial number and the lens of a folder of views."""
+  try:
+    about = json.loads((folder / CAMERA).read_text(encoding="utf-8"))
+    serial, lens = str(about["serial"]), about.get("lens")
+    return serial, None if lens is None else Lens.from_json(lens)
+  except OSError as error:
+    raise FileError(
+      f"cannot read {folder / CAMERA}: {error.strerror or error}"
+    ) from None
+  except (ValueError, KeyError, TypeError, AttributeError) as error:
+    raise FileError(
+      f'{folder / CAMERA} must have "serial" and may have "lens": {one_line(error)}'
+    ) from None
 
 
 def record(

@@ -24,7 +24,7 @@ from apnpql_jax.robot.calibration.boards import Board, _charuco
 from apnpql_jax.robot.calibration.lenses import Lens
 from apnpql_jax.sim.graphics import View
 
-HEIGHT, WIDTH = 540, 960
+HEIGHT, WIDTH = 432, 768
 NEUTRAL = np.array([-1.6, -1.7, 2.2, -2.1, -1.57, 0.0])
 FLIP = np.diag([1.0, -1.0, -1.0])  # OpenGL's camera axes to OpenCV's
 THICKNESS = 0.004
