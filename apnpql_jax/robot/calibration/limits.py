@@ -10,7 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from apnpql_jax.config.ranges import WRIST_SHARE
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import ConfigError, DeviceError
+from apnpql_jax.robot import images
 from apnpql_jax.robot.calibration.lenses import Lens
 
 Json = dict[str, Any]
@@ -19,10 +20,6 @@ TOLERANCE_M = {"global": 0.005, "wrist": 0.002}
 TOLERANCE_RAD = 0.01
 """Without domain randomization, or where its range is smaller, a camera may be off by
 this much along and about each axis."""
-
-TOLERANCE_VIEW = 0.02
-"""The same for the field of view, relative: the optical axis of a real camera does not
-meet the middle of its image."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,22 +103,11 @@ def check(contract: Json, name: str, pose: np.ndarray, lens: Lens) -> Difference
 
 
 def _check_view(contract: Json, name: str, lens: Lens) -> None:
-  """Checks that the camera's image covers the policy's, around the optical axis."""
-  ranges, camera = contract.get("randomization") or {}, contract["cameras"][name]
-  share = 1 - max(float(ranges.get("field_of_view", 0.0)), TOLERANCE_VIEW)
-  for axis, size, focal, center in (
-    ("vertical", lens.height, lens.fy, lens.cy),
-    ("horizontal", lens.width, lens.fx, lens.cx),
-  ):
-    edge = 0.5 + min(center, size - 1 - center)
-    seen = 2 * math.degrees(math.atan(edge / focal))
-    wanted = share * camera[f"{axis}_fov_deg"]
-    if seen < wanted:
-      raise ConfigError(
-        f"the {name} camera sees {seen:.1f} degrees ({axis}, around its optical axis), "
-        f"but the policy needs {wanted:.1f}: choose a mode of the camera with a wider "
-        "view"
-      )
+  """Checks that the camera sees what the policy needs, around the optical axis."""
+  try:
+    images.Preparation(lens.to_json(), contract["cameras"][name])
+  except DeviceError as error:
+    raise ConfigError(f"{name} camera: {error}") from None
 
 
 def to_json(pose: np.ndarray) -> Json:

@@ -11,6 +11,7 @@ import numpy as np
 
 from apnpql_jax.atomic import replacing
 from apnpql_jax.config import files
+from apnpql_jax.robot import images
 from apnpql_jax.robot.calibration.boards import opencv
 from apnpql_jax.robot.calibration.lenses import Lens
 from apnpql_jax.sim.graphics import View
@@ -50,6 +51,7 @@ def write(
 
   Raises:
     ConfigError: No graphics library can be loaded.
+    DeviceError: The camera sees less than the policy needs.
   """
   from PIL import Image
 
@@ -58,15 +60,9 @@ def write(
   focal = 0.5 * HEIGHT / math.tan(math.radians(camera["vertical_fov_deg"]) / 2)
   center = 0.5 * (width - 1), 0.5 * (HEIGHT - 1)
   plain = Lens(HEIGHT, width, focal, focal, *center)
-  maps = cv2.initUndistortRectifyMap(
-    lens.matrix,
-    np.array(lens.distortion),
-    np.eye(3),
-    plain.matrix,
-    (width, HEIGHT),
-    cv2.CV_32FC1,
-  )
-  real = cv2.remap(np.ascontiguousarray(image), *maps, cv2.INTER_AREA)
+  view = {**camera, "height": HEIGHT, "width": width}
+  view["intrinsics_px"] = {x: getattr(plain, x) for x in ("fx", "fy", "cx", "cy")}
+  real = images.Preparation(lens.to_json(), view)(np.ascontiguousarray(image))
   simulated = np.ascontiguousarray(_simulated(camera, name, pose, joints, width))
   edges = cv2.Canny(cv2.cvtColor(simulated, cv2.COLOR_RGB2GRAY), 40, 120) > 0
   both = real.copy()

@@ -289,7 +289,7 @@ def test_limits_are_those_of_the_randomization(contract):
   with pytest.raises(ConfigError, match=r"move it by \(-3\.0, [+-]0\.0, [+-]0\.0\) mm"):
     limits.check(contract, "wrist", moved, lens)
   narrow = dataclasses.replace(lens, fx=1800.0, fy=1800.0)
-  with pytest.raises(ConfigError, match="sees 22.6 degrees .vertical"):
+  with pytest.raises(ConfigError, match="global camera: the camera sees"):
     limits.check(contract, "global", limits.place(contract, "global")[0], narrow)
 
 
