@@ -141,7 +141,7 @@ def record(
   (folder / CAMERA).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
   count = 0
   while True:
-    answer = ask(f"view {count + 1}: move the arm by hand; Enter, or d when done: ")
+    answer = ask(f"{folder.name} {count + 1}: move the arm; Enter, or d when done: ")
     if answer.strip().lower() == "d":
       return
     joints, image = _at_rest(arm, camera)
