@@ -10,13 +10,19 @@ import dataclasses
 import numpy as np
 
 from apnpql_jax.robot.arm_model import ArmModel
-from apnpql_jax.robot.limits import Limits, MotionLimiter
+from apnpql_jax.robot.limits import TIMESTEP, Limits, MotionLimiter
 from apnpql_jax.robot.protocols import ArmState
 from apnpql_jax.robot.supervisor import Action, Mode, Supervisor
 from apnpql_jax.robot.virtual_arm import Admittance, VirtualArm
 
 _LIMITED = 0.01
 """Difference of velocities from which on the limits have changed a motion, rad/s."""
+
+_ARRIVED = 1e-4
+"""Distance at which a pose is reached, rad."""
+
+HOME_SPEED = 0.4
+"""Joint velocity of motions between episodes, rad/s."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,3 +80,21 @@ class Core:
       limiter.brake(measured)
       virtual.synchronize(limiter.position, limiter.velocity)
     return Command(limiter.position.copy(), mode, reason, limiter.at_rest)
+
+  def move(self, now: float, state: ArmState, target: np.ndarray) -> Command:
+    """Returns the command for the next 2 ms on a straight line of joints to a pose."""
+    limiter, gap = self.limiter, target - self.limiter.position
+    mode, reason = self.supervisor.judge_arm(now, state, limiter.position)
+    far = np.abs(gap).max()
+    if mode is Mode.FOLLOW and far > _ARRIVED:
+      slowing = 0.5 * self.limits.acceleration
+      speed = min(HOME_SPEED, np.sqrt(2 * slowing * far), far / TIMESTEP)
+      limiter.step(gap / far * speed, state.position)
+    else:
+      limiter.brake(state.position)
+    return Command(limiter.position.copy(), mode, reason, limiter.at_rest)
+
+  def has_arrived(self, target: np.ndarray) -> bool:
+    """Returns whether ``move`` has reached its target, at rest."""
+    limiter = self.limiter
+    return limiter.at_rest and np.abs(target - limiter.position).max() <= _ARRIVED

@@ -79,9 +79,22 @@ class Supervisor:
       action: The newest action, if any.
       command: The joint angles that the arm was sent last, f64[6].
     """
+    mode, reason = self.judge_arm(now, state, command)
+    if mode is Mode.STOP:
+      return mode, reason
+    late = self._check_actions(now, action)
+    if self._stop:
+      return Mode.STOP, self._stop
+    if mode is Mode.FOLLOW and late:
+      return Mode.HOLD, late
+    return mode, reason
+
+  def judge_arm(
+    self, now: float, state: ArmState, command: np.ndarray
+  ) -> tuple[Mode, str]:
+    """Returns what to do without a policy; see ``judge``."""
     self.stop(self._reason_to_stop(now, state, command))
-    late = "" if self._stop else self._check_actions(now, action)
-    hold = "" if self._stop else self._check_force(now, state) or late
+    hold = "" if self._stop else self._check_force(now, state)
     if self._stop:
       return Mode.STOP, self._stop
     return (Mode.HOLD, hold) if hold else (Mode.FOLLOW, "")

@@ -16,7 +16,7 @@ MODEL = ArmModel()
 UP = np.array([0.0, 0.0, 1.0])
 STILL = MODEL.dynamics(NEUTRAL, np.zeros(6))
 PRESS, KICK = 0.5, 0.05  # N beyond the dead zone, and of the disturbance
-NEAR = 0.15  # Relative distance from the predicted limit that the sweep leaves out.
+NEAR = 0.1  # Relative distance from the predicted limit that the sweep leaves out.
 
 
 def swing(stiffness: float, lag: float, admittance: Admittance, seconds: float):
@@ -31,21 +31,23 @@ def swing(stiffness: float, lag: float, admittance: Admittance, seconds: float):
   desired = -np.linalg.solve(STILL.mass, STILL.tool[:3].T @ UP) * PRESS / VELOCITY_GAIN
   assert np.abs(VELOCITY_GAIN * desired).max() < 1.2
   height = MODEL.tool_position(NEUTRAL)[2]
-  heights = [height] * max(1, round(lag / TIMESTEP))
+  heights = [height] * (1 + round(lag / TIMESTEP))
   forces, wrench = [], np.zeros(6)
   for cycle in range(round(seconds / TIMESTEP)):
     kick = KICK if cycle < 5 else 0.0
     wrench[2] = rest + kick - stiffness * (heights[0] - height)
     forces.append(wrench[2])
+    before = arm.position
     arm.step(desired, None, wrench)
+    # As the core does, which leaves out the lead.
+    arm.synchronize(before + TIMESTEP * arm.velocity, arm.velocity)
     heights = [*heights[1:], MODEL.tool_position(arm.position)[2]]
   return np.ptp(forces[-round(0.5 / TIMESTEP) :])
 
 
 def check(stiffness: float, lag: float, admittance: Admittance) -> bool | None:
   """Compares motion and prediction; returns which, or None near the limit."""
-  # On average, half a cycle passes until a held command has its effect.
-  limit = stiffness_limit(STILL, UP, admittance, lag + 0.5 * TIMESTEP)
+  limit = stiffness_limit(STILL, UP, admittance, lag)
   if abs(stiffness / limit - 1) < NEAR:
     return None
   stable = bool(stiffness < limit)
@@ -68,7 +70,8 @@ def test_stable_walls_are_the_predicted_ones_everywhere(damping_for):
     for k in np.geomspace(1e3, 5e4, 10)
     for lag in (0.002, 0.006, 0.01, 0.016, 0.024, 0.034, 0.046, 0.06)
   ]
-  assert outcomes.count(True) > 10 and outcomes.count(False) > 3
+  assert outcomes.count(True) > 10
+  assert outcomes.count(False) > 3 or damping_for > 1e4  # D_c bears all walls.
 
 
 def test_the_designed_stiffness_is_stable_without_the_motors():
