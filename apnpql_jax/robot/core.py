@@ -66,7 +66,8 @@ class Core:
 
   def step(self, now: float, state: ArmState, action: Action | None) -> Command:
     """Returns the command for the next 2 ms."""
-    limiter, virtual, measured = self.limiter, self.virtual, state.position
+    limiter, virtual = self.limiter, self.virtual
+    measured = self._measured(now, state)
     mode, reason = self.supervisor.judge(now, state, action, limiter.position)
     if mode is Mode.FOLLOW and action is not None:
       virtual.step(action.values[:6], measured, state.wrench)
@@ -91,8 +92,13 @@ class Core:
       speed = min(HOME_SPEED, np.sqrt(2 * slowing * far), far / TIMESTEP)
       limiter.step(gap / far * speed, state.position)
     else:
-      limiter.brake(state.position)
+      limiter.brake(self._measured(now, state))
     return Command(limiter.position.copy(), mode, reason, limiter.at_rest)
+
+  def _measured(self, now: float, state: ArmState) -> np.ndarray:
+    """Returns the joint angles; NaN if they are too old to stay close to."""
+    fresh = now - state.time <= self.limits.joint_age
+    return state.position if fresh else np.full(6, np.nan)
 
   def has_arrived(self, target: np.ndarray) -> bool:
     """Returns whether ``move`` has reached its target, at rest."""

@@ -71,7 +71,7 @@ def open_arm(robot: Robot) -> Generator[tuple[Arm, Gripper]]:
       arm = ur5e.UR5e(
         cell.arm_host, payload_kg=cell.payload_kg, payload_cog_m=cell.payload_cog_m
       )
-      gripper = grippers.connect(cell.gripper_port)
+      gripper = grippers.RHP12RN(cell.gripper_port)
     for device in (arm, gripper):
       device.connect()
       stack.callback(device.disconnect)
@@ -86,14 +86,39 @@ def open_cameras(robot: Robot) -> Generator[Sequence[Camera]]:
     if robot.kind == "simulated":
       rendered = importlib.import_module("apnpql_jax.robot.simulated_cameras")
       cameras: Sequence[Camera] = rendered.make(robot.plant, robot.contract)
+    elif robot.kind == "double":
+      doubles = importlib.import_module("apnpql_jax.robot.doubles.cameras")
+      eyes = doubles.cameras(
+        robot.cell.arm_host, robot.contract["task"], robot.contract
+      )
+      by_name = stack.enter_context(eyes)
+      cameras = [by_name[name] for name in CAMERAS]
     else:
       realsense = importlib.import_module("apnpql_jax.robot.drivers.realsense")
-      serials = robot.cell.cameras
-      cameras = [realsense.RealSense(serials[x], view=views[x]) for x in CAMERAS]
+      serials, lenses = robot.cell.cameras, calibrated_lenses(robot)
+      cameras = [
+        realsense.RealSense(serials[x], view=views[x], lens=lenses.get(x))
+        for x in CAMERAS
+      ]
     for camera in cameras:
       camera.connect()
       stack.callback(camera.disconnect)
     yield cameras
+
+
+def calibrated_lenses(robot: Robot) -> dict[str, Any]:
+  """Returns the lens of each calibrated camera; none without a calibration.
+
+  Raises:
+    FileError: The calibration is damaged or of other cameras.
+    ConfigError: A camera is not where the policy was trained for.
+  """
+  cell = robot.cell
+  if cell.calibration is None or not cell.calibration.exists():
+    return {}
+  files: Any = importlib.import_module("apnpql_jax.robot.calibration.files")
+  found = files.load(cell.calibration, robot.contract, cell.cameras)
+  return {name: camera.lens.to_json() for name, camera in found.cameras.items()}
 
 
 @contextlib.contextmanager

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Generator
 import contextlib
+import dataclasses
 import importlib
 from pathlib import Path
-from typing import Any
 
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.robot import cell as cells, devices
@@ -66,7 +66,11 @@ def doubled(robot: Robot) -> Generator[Robot]:
     return
   with devices.needing_packages(), contextlib.ExitStack() as stack:
     doubles = importlib.import_module("apnpql_jax.robot.doubles")
-    yield stack.enter_context(doubles.started(robot))
+    server = doubles.serve(robot.contract["task"])
+    stack.callback(server.close)
+    host, port = server.greeting
+    cell = dataclasses.replace(robot.cell, arm_host=host, gripper_port=port)
+    yield dataclasses.replace(robot, cell=cell)
 
 
 def _check_scene(policy: PolicyFolder) -> None:
@@ -85,5 +89,4 @@ def _check_calibration(robot: Robot) -> None:
   path = robot.cell.calibration
   if path is None or not path.is_file():
     raise ConfigError(f"{path} does not exist; make it with apnpql robot calibrate")
-  calibration: Any = importlib.import_module("apnpql_jax.robot.calibration.command")
-  calibration.check(path, robot)
+  devices.calibrated_lenses(robot)

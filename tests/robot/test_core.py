@@ -11,7 +11,7 @@ import pytest
 
 from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.core import Command, Core
-from apnpql_jax.robot.limits import TIMESTEP, Limits
+from apnpql_jax.robot.limits import BRAKING, TIMESTEP, Limits
 from apnpql_jax.robot.protocols import ArmState
 from apnpql_jax.robot.supervisor import Action, Mode
 from apnpql_jax.robot.virtual_arm import LEAD, Admittance, VirtualArm
@@ -150,6 +150,31 @@ def test_at_rest_within_half_a_second_of_a_fault_with_its_reason(reason):
   assert last.at_rest
   if np.isfinite(world.arm).all():
     assert np.abs(world.speed).max() < REST
+
+
+def test_a_lost_measurement_does_not_stop_the_command_abruptly():
+  world = moving()
+  stale_joints(world)
+  speeds, frozen = [world.core.limiter.velocity], world.arm.copy()
+  while not world.core.limiter.at_rest:
+    state = ArmState(world.measured_at, frozen, np.zeros(6), np.zeros(6))
+    world.core.step(world.now, state, world.action)
+    speeds.append(world.core.limiter.velocity)
+    world.cycle += 1
+  changes = np.abs(np.diff(speeds, axis=0)).max()
+  assert changes <= BRAKING * TIMESTEP + 1e-9
+
+
+def test_a_blocked_arm_ends_the_command_near_it():
+  world = moving()
+  push(60)(world)
+  blocked = world.arm.copy()
+  for _ in range(250):
+    world.arm = blocked
+    command = world.core.step(world.now, world.state(), world.action)
+    assert np.abs(command.position - blocked).max() <= LIMITS.deviation + 1e-9
+    world.cycle += 1
+  assert command.at_rest
 
 
 def test_a_protective_stop_of_the_arm_stops():
