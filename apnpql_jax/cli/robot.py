@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib
 from pathlib import Path
@@ -13,6 +14,8 @@ import tyro
 from apnpql_jax.cli.options import Command, File, Flag, default_hint
 from apnpql_jax.errors import ConfigError, check_name
 
+AsDefault = Annotated[str | None, default_hint("")]
+CAMERAS = ("global", "wrist")
 ACTIONS = ("check", "calibrate", "run")
 
 
@@ -67,6 +70,21 @@ class Robot(Command):
   yes: Flag = False
   """Move a real arm without asking."""
 
+  views: Path = Path("views")
+  """Folder of the views of the board, for calibrate."""
+
+  recorded: Flag = False
+  """Calibrate from the views that are in the folder, without devices."""
+
+  board: AsDefault = None
+  """The printed board, for calibrate; see docs/robot.md."""
+
+  board_on: str = "tool"
+  """Where the board is in views of the global camera: tool or table."""
+
+  overwrite: Flag = False
+  """Replace the calibration that exists."""
+
 
 def robot(args: Robot) -> dict[str, Any]:
   """Checks, calibrates or runs a robot and returns the result."""
@@ -89,8 +107,7 @@ def robot(args: Robot) -> dict[str, Any]:
     args.robot, policy, args.cell, slowdown=args.slowdown, calibrate=_calibrates(args)
   )
   if args.action == "calibrate":
-    command = importlib.import_module("apnpql_jax.robot.calibration.command")
-    return command.calibrate(opened)
+    return _calibrate(args, opened)
   with setup.doubled(opened) as opened:
     if args.action == "check":
       from apnpql_jax.robot.check import check
@@ -117,6 +134,25 @@ def _run(args: Robot, opened: Any, policy: Any) -> dict[str, Any]:
     ),
     episodes=args.episodes,
   )
+
+
+def _calibrate(args: Robot, opened: Any) -> dict[str, Any]:
+  """Calibrates the cameras of a cell; the arm only moves by hand."""
+  from apnpql_jax.robot import devices
+
+  if opened.cell.calibration is None:
+    raise ConfigError("only the cameras of --robot ur5e need a calibration")
+  command = importlib.import_module("apnpql_jax.robot.calibration.command")
+  settings: dict[str, Any] = {"board_on": args.board_on, "overwrite": args.overwrite}
+  if args.board is not None:
+    settings["board"] = args.board
+  with contextlib.ExitStack() as stack:
+    if not args.recorded:
+      arm, _ = stack.enter_context(devices.open_arm(opened))
+      cameras = stack.enter_context(devices.open_cameras(opened))
+      settings |= {"arm": arm, "cameras": dict(zip(CAMERAS, cameras, strict=True))}
+    out = opened.cell.calibration
+    return command.calibrate(opened.contract, args.views, out, **settings)
 
 
 def _calibrates(args: Robot) -> bool:

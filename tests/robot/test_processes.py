@@ -5,7 +5,7 @@ A slow clock makes the times independent of the load of the machine.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 import contextlib
 import dataclasses
 from multiprocessing import get_context
@@ -93,7 +93,7 @@ class Rig:
 
 
 @contextlib.contextmanager
-def rig() -> Iterator[tuple[Board, Rig]]:
+def rig() -> Generator[tuple[Board, Rig]]:
   """Starts a plant, a control process and the policy of this module."""
   context = get_context("spawn")
   robot = Robot("simulated", CONTRACT, Cell(), CLOCK)
