@@ -119,8 +119,8 @@ class Session(contextlib.AbstractContextManager):
         f"the arm does not reach its neutral pose: {state['reason'].decode()}"
       )
 
-  def play(self) -> Outcome:
-    """Plays an episode from the neutral pose.
+  def play(self, watch: Callable[[Any], None] | None = None) -> Outcome:
+    """Plays an episode from the neutral pose; ``watch`` gets the records "policy".
 
     Raises:
       DeviceError: A process has ended.
@@ -134,6 +134,8 @@ class Session(contextlib.AbstractContextManager):
 
     def over() -> bool:
       policy = self.board["policy"].read()
+      if watch is not None:
+        watch(policy)
       return self._is_done() or bool(policy["order"] == number and policy["over"])
 
     limit = 2 * self._policy.contract["time_limit_s"] + 60

@@ -8,7 +8,6 @@ import subprocess
 import sys
 from typing import Any
 
-from make_policy import export_untrained
 import numpy as np
 import pytest
 
@@ -16,7 +15,7 @@ from apnpql_jax.cli.main import main
 from apnpql_jax.deploy.export import VERSION
 from apnpql_jax.errors import ConfigError, FileError
 from apnpql_jax.robot import cell, devices, policy_folder
-from apnpql_jax.testing import ROOT
+from apnpql_jax.testing import ROOT, export_untrained
 
 
 @pytest.fixture(scope="module")

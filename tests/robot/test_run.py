@@ -7,10 +7,10 @@ from pathlib import Path
 import subprocess
 import sys
 
-from make_policy import export_untrained
 import pytest
 
 from apnpql_jax import testing
+from apnpql_jax.testing import export_untrained
 
 SLOWDOWN = "8"
 
