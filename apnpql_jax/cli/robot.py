@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import importlib
 from pathlib import Path
 import sys
 from typing import Annotated, Any
@@ -77,7 +76,10 @@ class Robot(Command):
   """Calibrate from the views that are in the folder, without devices."""
 
   board: AsDefault = None
-  """The printed board, for calibrate; see docs/robot.md."""
+  """The printed board, for calibrate, such as 11x8:33.5:25:6x6_250."""
+
+  print_board: File = None
+  """Write the board as .pdf or .png to print it, for calibrate."""
 
   board_on: str = "tool"
   """Where the board is in views of the global camera: tool or table."""
@@ -96,6 +98,11 @@ def robot(args: Robot) -> dict[str, Any]:
 
   devices.check_kind(args.robot)
   _check_options(args)
+  if args.print_board is not None:
+    from apnpql_jax.robot.calibration import boards
+
+    board = boards.Board() if args.board is None else boards.parse(args.board)
+    return boards.print_board(board, args.print_board)
   if args.policy is None:
     raise ConfigError("robot needs --policy, the folder of an exported policy")
 
@@ -142,7 +149,8 @@ def _calibrate(args: Robot, opened: Any) -> dict[str, Any]:
 
   if opened.cell.calibration is None:
     raise ConfigError("only the cameras of --robot ur5e need a calibration")
-  command = importlib.import_module("apnpql_jax.robot.calibration.command")
+  from apnpql_jax.robot.calibration import command
+
   settings: dict[str, Any] = {"board_on": args.board_on, "overwrite": args.overwrite}
   if args.board is not None:
     settings["board"] = args.board
