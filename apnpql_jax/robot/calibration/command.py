@@ -145,23 +145,23 @@ def calibrate_cell(
   *,
   host: str,
   serials: Mapping[str, str],
+  recorded: bool,
   board: str = Board().text,
   board_on: str = "tool",
-  only: str = "",
   ask: Callable[[str], str] = input,
   overwrite: bool = False,
 ) -> Json:
-  """Calibrates the cameras of a cell; takes views first unless the folder has some.
+  """Calibrates the cameras of a cell.
 
   Args:
     contract: That of the policy.
-    folder: Folder of the views; if it is missing, views are taken and written there.
+    folder: Folder of the views.
     out: See ``calibrate``.
     host: Address of the arm's controller.
     serials: Camera by its name -> its serial number.
+    recorded: The folder has the views; otherwise they are taken with the devices.
     board: See ``calibrate``.
     board_on: See ``calibrate``.
-    only: Name of the only camera of which to take views.
     ask: See ``views.record``.
     overwrite: See ``calibrate``.
 
@@ -170,16 +170,13 @@ def calibrate_cell(
   """
   options: Json = {"board": board, "board_on": board_on, "overwrite": overwrite}
   options |= {"serials": serials, "ask": ask}
-  if folder.exists():
+  if recorded:
     return calibrate(contract, folder, out, **options)
 
   from apnpql_jax.robot.drivers.realsense import RealSense
   from apnpql_jax.robot.drivers.ur_listener import Listener
 
   names = sorted(contract["cameras"], reverse=True)
-  if only:
-    check_name("camera", only, names)
-    names = [only]
   arm = Listener(host)
   cameras = {
     name: RealSense(serials[name], view=contract["cameras"][name], size=SIZE)

@@ -51,7 +51,9 @@ def test_a_missing_device_is_one_line(rig, tmp_path):
   serials = {"global": "1", "wrist": "2"}
 
   def calibrate(host: str) -> None:
-    command.calibrate_cell(contract, views, out, host=host, serials=serials)
+    command.calibrate_cell(
+      contract, views, out, host=host, serials=serials, recorded=False
+    )
 
   views, out = tmp_path / "views", tmp_path / "calibration.json"
   with pytest.raises(DeviceError, match="camera 2: not found .no camera is connected"):
