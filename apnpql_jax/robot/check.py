@@ -96,4 +96,5 @@ def _first(camera: Any) -> Any:
 
 
 def _text(about: dict[str, Any]) -> str:
-  return ", ".join(str(value) for value in about.values())
+  """Returns model, serial number and versions in a line."""
+  return ", ".join(str(x) for x in about.values() if isinstance(x, str | int))
