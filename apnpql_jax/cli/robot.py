@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 from pathlib import Path
 import sys
@@ -14,7 +13,6 @@ from apnpql_jax.cli.options import Command, File, Flag, default_hint
 from apnpql_jax.errors import ConfigError, check_name
 
 AsDefault = Annotated[str | None, default_hint("")]
-CAMERAS = ("global", "wrist")
 ACTIONS = ("check", "calibrate", "run")
 
 
@@ -69,8 +67,9 @@ class Robot(Command):
   yes: Flag = False
   """Move a real arm without asking."""
 
-  views: Path = Path("views")
-  """Folder of the views of the board, for calibrate."""
+  views: Annotated[Path, default_hint("(default: views)")] = Path("views")
+  """Folder of the views of the board, for calibrate: to make, or with --recorded, to
+  read."""
 
   recorded: Flag = False
   """Calibrate from the views that are in the folder, without devices."""
@@ -145,22 +144,21 @@ def _run(args: Robot, opened: Any, policy: Any) -> dict[str, Any]:
 
 def _calibrate(args: Robot, opened: Any) -> dict[str, Any]:
   """Calibrates the cameras of a cell; the arm only moves by hand."""
-  from apnpql_jax.robot import devices
-
-  if opened.cell.calibration is None:
+  if (out := opened.cell.calibration) is None:
     raise ConfigError("only the cameras of --robot ur5e need a calibration")
-  from apnpql_jax.robot.calibration import command
+  from apnpql_jax.robot.calibration import boards, command
 
-  settings: dict[str, Any] = {"board_on": args.board_on, "overwrite": args.overwrite}
-  if args.board is not None:
-    settings["board"] = args.board
-  with contextlib.ExitStack() as stack:
-    if not args.recorded:
-      arm, _ = stack.enter_context(devices.open_arm(opened))
-      cameras = stack.enter_context(devices.open_cameras(opened))
-      settings |= {"arm": arm, "cameras": dict(zip(CAMERAS, cameras, strict=True))}
-    out = opened.cell.calibration
-    return command.calibrate(opened.contract, args.views, out, **settings)
+  return command.calibrate_cell(
+    opened.contract,
+    args.views,
+    out,
+    host=opened.cell.arm_host,
+    serials=opened.cell.cameras,
+    recorded=args.recorded,
+    board=boards.Board().text if args.board is None else args.board,
+    board_on=args.board_on,
+    overwrite=args.overwrite,
+  )
 
 
 def _calibrates(args: Robot) -> bool:

@@ -96,9 +96,9 @@ def open_cameras(robot: Robot) -> Generator[Sequence[Camera]]:
       cameras = [by_name[name] for name in CAMERAS]
     else:
       realsense = importlib.import_module("apnpql_jax.robot.drivers.realsense")
-      serials, lenses = robot.cell.cameras, calibrated_lenses(robot)
+      serials, modes = robot.cell.cameras, calibrated_modes(robot)
       cameras = [
-        realsense.RealSense(serials[x], view=views[x], lens=lenses.get(x))
+        realsense.RealSense(serials[x], view=views[x], **modes.get(x, {}))
         for x in CAMERAS
       ]
     for camera in cameras:
@@ -107,8 +107,10 @@ def open_cameras(robot: Robot) -> Generator[Sequence[Camera]]:
     yield cameras
 
 
-def calibrated_lenses(robot: Robot) -> dict[str, Any]:
-  """Returns the lens of each calibrated camera; none without a calibration.
+def calibrated_modes(robot: Robot) -> dict[str, Any]:
+  """Returns lens and image size of each camera whose lens the calibration estimated.
+
+  The other cameras have the maker's lens, in whichever mode.
 
   Raises:
     FileError: The calibration is damaged or of other cameras.
@@ -119,7 +121,14 @@ def calibrated_lenses(robot: Robot) -> dict[str, Any]:
     return {}
   files: Any = importlib.import_module("apnpql_jax.robot.calibration.files")
   found = files.load(cell.calibration, robot.contract, cell.cameras)
-  return {name: camera.lens.to_json() for name, camera in found.cameras.items()}
+  return {
+    name: {
+      "lens": camera.lens.to_json(),
+      "size": (camera.lens.height, camera.lens.width),
+    }
+    for name, camera in found.cameras.items()
+    if camera.about.get("lens_from") == "views"
+  }
 
 
 @contextlib.contextmanager

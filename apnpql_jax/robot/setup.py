@@ -89,4 +89,4 @@ def _check_calibration(robot: Robot) -> None:
   path = robot.cell.calibration
   if path is None or not path.is_file():
     raise ConfigError(f"{path} does not exist; make it with apnpql robot calibrate")
-  devices.calibrated_lenses(robot)
+  devices.calibrated_modes(robot)

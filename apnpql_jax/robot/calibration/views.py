@@ -124,6 +124,7 @@ def record(
     arm: The arm, connected.
     camera: The camera, connected.
     ask: Shows a text and returns what the user types: nothing for a view, d when done.
+      Without a view, no folder is made.
 
   Raises:
     ConfigError: The camera is simulated.
@@ -136,12 +137,10 @@ def record(
     raise ConfigError(f"the {folder.name} camera gives no images of its sensor")
   if folder.exists():
     raise FileError(f"{folder} exists; name another folder for new views")
-  folder.mkdir(parents=True)
   about = {"serial": str(camera.describe()["serial_number"]), "lens": camera.lens()}
-  (folder / CAMERA).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
   count = 0
   while True:
-    answer = ask(f"view {count + 1}: move the arm by hand; Enter, or d when done: ")
+    answer = ask(f"{folder.name} {count + 1}: move the arm; Enter, or d when done: ")
     if answer.strip().lower() == "d":
       return
     joints, image = _at_rest(arm, camera)
@@ -149,6 +148,10 @@ def record(
     if seen is None:
       print_line("the board is not in view; try another posture")
       continue
+    folder.mkdir(parents=True, exist_ok=True)
+    if not count:
+      text = json.dumps(about, indent=2) + "\n"
+      (folder / CAMERA).write_text(text, encoding="utf-8")
     Image.fromarray(image).save(folder / f"{count:03d}.png")
     text = json.dumps({"joints": joints.tolist()}) + "\n"
     (folder / f"{count:03d}.json").write_text(text, encoding="utf-8")

@@ -19,13 +19,17 @@ pytest.importorskip("cv2")
 import jax
 from rendered import HEIGHT, WIDTH, Studio, displace, postures, studio, write_views
 
+from apnpql_jax.cli import robot as cli
+from apnpql_jax.cli.main import main
 from apnpql_jax.config import files as project_files
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.deploy import contract as contracts
 from apnpql_jax.errors import ConfigError, FileError, UserError
+from apnpql_jax.robot import devices
 from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.calibration import command, files, limits, solve, views
 from apnpql_jax.robot.calibration.boards import Board
+from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.protocols import ArmState, Frame
 from apnpql_jax.sim.scene import load_scene
 
@@ -413,6 +417,34 @@ def test_an_earlier_calibration_is_kept_or_completed(
   assert loaded.cameras["global"].serial == "of global"
   assert loaded.cameras["wrist"].serial == "serial of wrist"
   assert_close(loaded.cameras["wrist"].pose, wrist.truth)
+
+
+def test_the_command_calibrates_a_cell(contract, both, tmp_path, held):
+  """Without devices; the lens that is the maker's is not that of another mode."""
+  out = tmp_path / "calibration.json"
+  serials = {name: f"serial of {name}" for name in contract["cameras"]}
+  robot = devices.Robot("ur5e", contract, Cell(calibration=out, cameras=serials))
+  args = cli.Robot(action="calibrate", robot="ur5e", views=both, recorded=True)
+  result = cli._calibrate(args, robot)
+  assert result["wrist"]["views"] >= 8 and result["global"]["views"] >= 8
+  assert_close(files.read(out).cameras["global"].pose, held.truth)
+  assert devices.calibrated_modes(robot) == {}
+  value = json.loads(out.read_text())
+  value["cameras"]["wrist"]["lens_from"] = "views"
+  out.write_text(json.dumps(value))
+  (mode,) = devices.calibrated_modes(robot).values()
+  assert mode["size"] == (HEIGHT, WIDTH) and mode["lens"]["fx"] > 0
+  with pytest.raises(ConfigError, match="only the cameras of --robot ur5e"):
+    cli._calibrate(args, devices.Robot("simulated", contract, Cell()))
+
+
+def test_the_command_prints_a_board(tmp_path, capfd):
+  path = tmp_path / "board.pdf"
+  assert main(["robot", "calibrate", "--print-board", str(path)]) == 0
+  assert "7 squares must be 252 mm long" in capfd.readouterr().out
+  assert path.exists()
+  assert main(["robot", "calibrate", "--print-board", "x.pdf", "--board", "3"]) == 2
+  assert "'3' is no board; write it as 7x5:36:27" in capfd.readouterr().err
 
 
 class Hand:
