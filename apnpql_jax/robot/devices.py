@@ -45,7 +45,7 @@ class Robot:
   cell: Cell
   """The cell, with addresses and limits."""
 
-  clock: Clock = Clock()  # noqa: RUF009 (frozen)
+  clock: Clock = Clock()
   """The clock of the session."""
 
   plant: str = ""
