@@ -51,6 +51,8 @@ def check(
     angle = gripper.get_observation().angle
     lines["gripper"] = f"{_text(gripper.describe())}; at {angle:.2f} rad"
     cameras = stack.enter_context(devices.open_cameras(robot))
+    for camera in cameras:  # The first frame may take long.
+      _first(camera)
     for name, camera in zip(CAMERAS, cameras, strict=True):
       frame, view = _first(camera), contract["cameras"][name]
       if frame.image.shape != (view["height"], view["width"], 3):
@@ -96,4 +98,5 @@ def _first(camera: Any) -> Any:
 
 
 def _text(about: dict[str, Any]) -> str:
-  return ", ".join(str(value) for value in about.values())
+  """Returns model, serial number and versions in a line."""
+  return ", ".join(str(x) for x in about.values() if isinstance(x, str | int))

@@ -203,6 +203,7 @@ def main(
     events: Gets changes of the mode, and an error that ends the process, as text.
     peer: Its other end is with the policy process alone.
   """
+  devices.leave_interrupts_to_the_main_process()
   # More often than every 5 ms, so that the gripper's thread does not hold up cycles.
   sys.setswitchinterval(5e-4)
   board = Board(board_name)

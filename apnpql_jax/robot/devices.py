@@ -9,6 +9,7 @@ from collections.abc import Generator, Sequence
 import contextlib
 import dataclasses
 import importlib
+import signal
 from typing import Any
 
 from apnpql_jax.errors import ConfigError, DeviceError, one_line
@@ -44,7 +45,7 @@ class Robot:
   cell: Cell
   """The cell, with addresses and limits."""
 
-  clock: Clock = Clock()  # noqa: RUF009 (frozen)
+  clock: Clock = Clock()
   """The clock of the session."""
 
   plant: str = ""
@@ -142,6 +143,11 @@ def needing_packages() -> Generator[None]:
     raise ConfigError(
       f"robot needs {_PACKAGES[name]}: pip install 'apnpql-jax[robot]'"
     ) from error
+
+
+def leave_interrupts_to_the_main_process() -> None:
+  """Ignores Ctrl-C, which the terminal sends to all; the main process brakes first."""
+  signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def check_kind(kind: str) -> None:

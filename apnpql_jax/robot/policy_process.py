@@ -126,6 +126,7 @@ def main(robot: Robot, board_name: str, options: dict[str, Any], peer: Pipe) -> 
       log whose actions to repeat or None.
     peer: Its other end is with the control process alone, whose end ends this one.
   """
+  devices.leave_interrupts_to_the_main_process()
   threading.Thread(target=_end_with, args=(peer,), daemon=True).start()
   board = Board(board_name)
   try:

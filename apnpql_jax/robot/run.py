@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+import contextlib
 import dataclasses
 import json
 from pathlib import Path
+import signal
 from typing import Any
 
 from apnpql_jax.console import print_line
@@ -13,6 +16,7 @@ from apnpql_jax.robot import recorder
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.session import Options, Outcome, Session
+from apnpql_jax.robot.supervisor import NO_ACTION
 from apnpql_jax.runs.metrics import wilson_interval
 
 EVENTS = "episodes.jsonl"
@@ -33,6 +37,7 @@ def run(
     ConfigError: A package is missing.
     FileError: The log exists, or the one to replay is none.
     DeviceError: A device or process has failed.
+    RunStopped: SIGINT or SIGTERM came; the arm is at rest.
   """
   if options.log is not None:
     recorder.check_available()
@@ -42,7 +47,9 @@ def run(
     recorder.recorded_actions(Path(options.replay))
   outcomes: list[Outcome] = []
   failure = ""
-  with Session(robot, policy, options) as session:
+  with contextlib.ExitStack() as stack:
+    caught = stack.enter_context(catching_signals())
+    session = stack.enter_context(Session(robot, policy, options, caught))
     session.wait_until_ready()
     try:
       for episode in range(episodes):
@@ -58,11 +65,33 @@ def run(
   return _summary(robot, options, outcomes, failure)
 
 
+@contextlib.contextmanager
+def catching_signals() -> Generator[list[int]]:
+  """Yields a list that gets SIGINT and SIGTERM, which otherwise would end all at once.
+
+  A session ends at the first one, with the arm at rest.
+  """
+  caught: list[int] = []
+  wake = signal.set_wakeup_fd(-1)  # Of ``runs.signals``, which would end at once.
+  before = {
+    number: signal.signal(number, lambda number, _: caught.append(number))
+    for number in (signal.SIGINT, signal.SIGTERM)
+  }
+  try:
+    yield caught
+  finally:
+    for number, handler in before.items():
+      signal.signal(number, handler)
+    signal.set_wakeup_fd(wake)
+
+
 def _report(episode: int, episodes: int, outcome: Outcome) -> None:
-  holds = sum(mode == "hold" for _, mode, _ in outcome.events)
+  holds = sum(
+    mode == "hold" and reason != NO_ACTION for _, mode, reason in outcome.events
+  )
   print_line(
     f"episode {episode + 1} of {episodes}: {outcome.reason}, {outcome.seconds:.1f} s, "
-    f"{outcome.actions} actions, {holds - 1 if holds else 0} holds"
+    f"{outcome.actions} actions, {holds} holds"
   )
 
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import contextlib
 import dataclasses
 from multiprocessing import get_context
+import signal
 import time
 from typing import Any
 
-from apnpql_jax.errors import DeviceError
+from apnpql_jax.errors import INTERRUPTED, DeviceError, RunStopped
 from apnpql_jax.robot import control_process, policy_process, simulated
 from apnpql_jax.robot.board import Board, Phase
 from apnpql_jax.robot.devices import Robot
@@ -68,8 +69,19 @@ class Outcome:
 class Session(contextlib.AbstractContextManager):
   """The processes of a robot; leaving the context brings the arm to rest."""
 
-  def __init__(self, robot: Robot, policy: PolicyFolder, options: Options):
-    """Starts the processes; ``wait_until_ready`` follows."""
+  def __init__(
+    self,
+    robot: Robot,
+    policy: PolicyFolder,
+    options: Options,
+    signals: Sequence[int] = (),
+  ):
+    """Starts the processes; ``wait_until_ready`` follows.
+
+    All methods raise ``RunStopped`` as soon as there are ``signals``, a list that
+    grows; leave the context then.
+    """
+    self._signals = signals
     self._policy, self._clock = policy, robot.clock
     self._judged = robot.kind == "simulated"
     self._number = self._scene = 0
@@ -232,6 +244,9 @@ class Session(contextlib.AbstractContextManager):
 
   def _check_processes(self) -> None:
     self._take_events()
+    if self._signals:
+      name = signal.Signals(self._signals[0]).name
+      raise RunStopped(f"{name}: the arm is at rest", INTERRUPTED + self._signals[0])
     failure = self._failure or self.board["policy"].read()["error"].decode()
     if not failure and self._plant is not None:
       failure = self._plant["plant"].read()["error"].decode()

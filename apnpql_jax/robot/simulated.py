@@ -221,6 +221,7 @@ def main(name: str, task_name: str, options: dict[str, Any]) -> None:
     task_name: Name of the task.
     options: ``seed`` of the reset states, ``latency_s``, ``clock``.
   """
+  devices.leave_interrupts_to_the_main_process()
   board = Board(name, RECORDS)
   try:
     tasks = importlib.import_module("apnpql_jax.tasks")

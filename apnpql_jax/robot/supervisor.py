@@ -16,6 +16,9 @@ from apnpql_jax.robot.protocols import ArmState
 
 CAMERAS = ("global", "wrist")
 
+NO_ACTION = "policy: no action yet"
+"""Reason of the hold with which each episode begins."""
+
 PATIENCE_S = 5.0
 """Time that the first action may take."""
 
@@ -139,7 +142,7 @@ class Supervisor:
     if self._valid is None:
       if waited > PATIENCE_S:
         self.stop(cause or f"policy: no action within {PATIENCE_S:.0f} s")
-      return cause or "policy: no action yet"
+      return cause or NO_ACTION
     if waited > 3 * period:
       self.stop(cause or "policy: two periods late")
     if waited > 2 * period:

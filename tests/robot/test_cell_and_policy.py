@@ -103,6 +103,11 @@ def test_the_example_of_a_cell_is_valid(tmp_path):
   assert limits.period == 0.1
 
 
+def test_the_page_shows_the_example():
+  page = (ROOT / "docs" / "robot.md").read_text(encoding="utf-8")
+  assert f"```toml\n{cell.EXAMPLE}```" in page
+
+
 @pytest.mark.parametrize(
   ("old", "new", "message"),
   [
