@@ -15,9 +15,9 @@ import numpy as np
 
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.render import Lighting
+from apnpql_jax.sim.graphics import area_resized, off_screen
 from apnpql_jax.sim.scene import Scene, compile_file
 from apnpql_jax.transfer import looks
-from apnpql_jax.transfer.graphics import area_resized, off_screen
 
 CAMERAS = ("global", "wrist")
 OVERSAMPLING = 2

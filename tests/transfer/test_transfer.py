@@ -18,12 +18,12 @@ from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.envs.state import EnvState
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.randomization.randomize import make_randomize
+from apnpql_jax.sim.graphics import area_resized
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.tasks import Task
 from apnpql_jax.training.rollout import expert_policy, make_player
 from apnpql_jax.training.train import train
 from apnpql_jax.transfer import looks
-from apnpql_jax.transfer.graphics import area_resized
 from apnpql_jax.transfer.opengl import OpenGL
 from apnpql_jax.transfer.play import play
 from apnpql_jax.transfer.transfer import Cell, make_draw, transfer, transfer_expert

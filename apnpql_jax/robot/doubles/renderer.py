@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from apnpql_jax.robot.doubles.plant import compile_scene
-from apnpql_jax.transfer.graphics import off_screen
+from apnpql_jax.sim.graphics import off_screen
 
 AMBIENT, DIFFUSE = 0.35, 0.65
 """Light of the images of the training."""

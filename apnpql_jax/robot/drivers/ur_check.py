@@ -32,7 +32,7 @@ def check_controller(host: str, dashboard_client: Any) -> dict[str, Any]:
     DeviceError: Nothing answers there, or something that is not a UR5e, or the teach
       pendant has control.
   """
-  _check_rtde(host)
+  check_rtde(host)
   about, remote = _ask_dashboard(host, dashboard_client)
   version = tuple(int(x) for x in about["polyscope"].split(".")[:2])
   model = about["model"].upper().replace(" ", "")
@@ -48,7 +48,8 @@ def check_controller(host: str, dashboard_client: Any) -> dict[str, Any]:
   return {**about, "model": "UR5e"}
 
 
-def _check_rtde(host: str) -> None:
+def check_rtde(host: str) -> None:
+  """Raises ``DeviceError`` unless a controller answers at ``host``."""
   for port in (_RTDE, _SCRIPT):
     try:
       with socket.create_connection((host, port), _PATIENCE) as connection:
