@@ -5,6 +5,9 @@ Such runs compile without optimization, because optimizing takes longer than it 
 
 from __future__ import annotations
 
+import hashlib
+from importlib import metadata
+import json
 import os
 from pathlib import Path
 import subprocess
@@ -123,6 +126,46 @@ SMALL = AgentConfig(
 """Settings that compile in a few seconds for every row of Table I."""
 
 
+def export_untrained(
+  folder: Path, agent: AgentConfig = SMALL, *, time_limit_s: float = 3.0
+) -> dict[str, Any]:
+  """Writes a policy for push_plate with random weights as ``apnpql export`` does.
+
+  Returns its contract, without most of its origin.
+  """
+  from apnpql_jax.agents.learner import make_agent
+  from apnpql_jax.deploy import contract, program
+  from apnpql_jax.deploy.export import CONTRACT, PROGRAM, VERSION
+  from apnpql_jax.envs.env import observation_shapes
+  from apnpql_jax.tasks import make_task
+
+  config = EnvConfig(time_limit_s=time_limit_s)
+  learner, task = make_agent(agent), make_task(config.task)
+  seen = observation_shapes(config, task, instants=agent.lstm_instants)
+  zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), seen)
+  params = learner.init(jax.random.key(1), zeros).params
+  shapes = contract.fields(seen)
+  made = program.export(program.make_act(learner, params, acting="policy"), shapes)
+  about = {
+    "contract": VERSION,
+    "program": {
+      "file": PROGRAM,
+      "sha256": hashlib.sha256(made.data).hexdigest(),
+      "xla_flags": os.environ.get("XLA_FLAGS", ""),
+    },
+    "acting": {"rule": "policy", "needs_key": made.needs_key},
+    **contract.describe(config, task.scene, shapes, instants=agent.lstm_instants),
+    "origin": {
+      "scene_sha256": task.scene.fingerprint,
+      "exported_with": {"packages": {"jaxlib": metadata.version("jaxlib")}},
+    },
+  }
+  folder.mkdir(parents=True, exist_ok=True)
+  (folder / PROGRAM).write_bytes(made.data)
+  (folder / CONTRACT).write_text(json.dumps(about), encoding="utf-8")
+  return about
+
+
 def random_batch(
   seed: int,
   batch: int = 16,
@@ -181,4 +224,5 @@ def random_batch(
     primitives_tm1=action(batch, 3),
     weight=jnp.ones(batch),
     window=slots(batch, windows) if windows else None,
+    expert_tm1=action(batch),
   )

@@ -65,6 +65,9 @@ class TimeStep(struct.PyTreeNode):
   primitives: Float[Array, "*b 3 7"]
   """Privileged labels: an action per primitive."""
 
+  expert: Float[Array, "*b 7"] | None = None
+  """Privileged label: the scripted expert's action; only for rows that imitate it."""
+
   @property
   def last(self) -> Bool[Array, "*b"]:
     """Whether the episode ended here; an action taken here is ignored."""
@@ -110,3 +113,6 @@ class Transition(struct.PyTreeNode):
 
   window: Slot | None = None
   """[B, N, ...]: the instants 1 to N after the state acted upon."""
+
+  expert_tm1: Float[Array, "B 7"] | None = None
+  """The scripted expert's action at the state acted upon."""

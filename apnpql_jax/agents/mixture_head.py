@@ -22,11 +22,13 @@ def mixture_from_outputs(
   max_std: float,
   min_prob: float,
   diagonal: bool = False,
+  gripper_offset: bool = True,
 ) -> GripperGMM:
   """Converts raw outputs of a head to a mixture of ``num`` components.
 
   The means are ``primitives`` f32[*b, K, 7], clipped to the action box, with logits of
-  closing the gripper to which an output is added; if None, outputs hold the means.
+  closing the gripper to which an output is added, unless ``gripper_offset`` is false.
+  Without ``primitives``, outputs hold the means.
 
   Each row of a Cholesky factor is a direction times the standard deviation of that
   joint (rad/s), ``initial_std`` for outputs of zero. One-way clips limit standard
@@ -44,6 +46,8 @@ def mixture_from_outputs(
     close = jnp.clip(primitives[..., dim], -surest, surest)
   end = dim * (dim + 1) // 2
   log_std, below, logits, gripper = jnp.split(outputs, [dim, end, end + 1], axis=-1)
+  if gripper_offset:
+    close = one_way_clip(close + gripper[..., 0], -surest, surest)
   log_std = log_std + math.log(initial_std)
   log_std = one_way_clip(log_std, math.log(min_std), math.log(max_std))
   widest = 0.5 * math.log((1.0 - (num - 1) * min_prob) / min_prob)
@@ -52,7 +56,7 @@ def mixture_from_outputs(
     logits=jax.nn.log_softmax(logits),
     loc=mean,
     scale_tril=_scale_tril(log_std, jnp.zeros_like(below) if diagonal else below),
-    gripper_logits=one_way_clip(close + gripper[..., 0], -surest, surest),
+    gripper_logits=close,
   )
 
 

@@ -114,15 +114,17 @@ class Heads:
     Means are the predicted primitives, clipped to the action box (paper Sec. IV-A). The
     M-step trains the rest of theta and must move neither the means nor phi.
     """
+    learned_mean = self.config.prior_mean == "learned"
     return mixture_from_outputs(
       self._apply("bp", jax.lax.stop_gradient(self.phi)),
-      None if self.config.prior_mean == "learned" else self.frozen().primitives(),
+      None if learned_mean else self.frozen().primitives(),
       num=NUM_PRIMITIVES,
       min_std=self.config.min_std,
       initial_std=self.config.initial_std,
       max_std=self.config.max_std,
       min_prob=self.config.min_prob,
       diagonal=self.config.diagonal_covariance,
+      gripper_offset=learned_mean or self.config.gripper_offset,
     )
 
   def policy(self) -> GripperGMM:

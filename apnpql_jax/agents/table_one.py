@@ -6,7 +6,12 @@ from collections.abc import Callable
 import dataclasses
 
 from apnpql_jax.agents.columns.candidates import Candidates
-from apnpql_jax.agents.columns.policy import cem, non_parametric, parametric
+from apnpql_jax.agents.columns.policy import (
+  cem,
+  non_parametric,
+  parametric,
+  prior_alone,
+)
 from apnpql_jax.agents.columns.policy_evaluation import (
   TD0,
   Categorical,
@@ -25,6 +30,7 @@ from apnpql_jax.agents.columns.regularizer import (
   behavior_prior,
   fit_advantageous,
   fit_candidates,
+  fit_expert,
   no_update,
   previous_policy,
   uniform,
@@ -74,6 +80,8 @@ ALGORITHMS = {
     uniform,         parametric,     no_update,        reverse_kl, ClippedDoubleQ),
   "ap_cem": Algorithm(  # not in the paper: QT-Opt's policy with b around primitives
     behavior_prior,  cem,            fit_candidates,   none,       ClippedDoubleQ),
+  "ap_dagger": Algorithm(  # not in the paper: b imitates the expert, Q is not used
+    behavior_prior,  prior_alone,    fit_expert,       none,       Categorical),
 }  # fmt: skip
 
 POLICY_EVALUATIONS = {  # values of ``agent.policy_evaluation`` other than "row"
@@ -104,6 +112,11 @@ def algorithm_of(config: AgentConfig) -> Algorithm:
       "lacks; choose another policy evaluation"
     )
   return row
+
+
+def imitates(config: AgentConfig) -> bool:
+  """Returns whether the row learns from ``Transition.expert_tm1``."""
+  return algorithm_of(config).regularizer_update is fit_expert
 
 
 def epsilon_bounds() -> dict[str, tuple[str, ...]]:

@@ -35,6 +35,9 @@ if TYPE_CHECKING:
 
 Json = dict[str, Any]
 
+FORMATS = ("npz", "lerobot")
+"""Formats of what ``collect`` saves."""
+
 
 def base_config(args: Train) -> TrainConfig:
   """Returns the settings that ``train`` starts from: those of the preset or the run."""
@@ -117,9 +120,13 @@ def diagnose(args: Diagnose) -> Json:
 def collect(args: Collect) -> Json:
   """Plays episodes with the scripted expert of a task."""
   check_free(args.video, overwrite=args.overwrite)
-  if args.save is None and (args.append or args.solved_only):
-    raise ConfigError("--append and --solved-only need --save FILE.npz")
-  if args.save is not None:
+  check_name("--format", args.format, FORMATS)
+  dataset = args.format == "lerobot"
+  if args.save is None and (args.append or args.solved_only or dataset):
+    raise ConfigError("--append, --solved-only and --format need --save")
+  if args.save is not None and dataset:
+    _check_dataset(args.save, append=args.append)
+  elif args.save is not None:
     _check_demonstrations(args.save, overwrite=args.overwrite, append=args.append)
   # The expert acts on privileged poses, so images are not needed.
   env = dataclasses.replace(task_env(args.task), backend=args.backend, obs="state")
@@ -133,14 +140,17 @@ def collect(args: Collect) -> Json:
   figures = evaluate_expert(env, video=args.video, **settings)
   if args.save is not None:
     demos = expert.record_expert(make_env(env), **settings)
-    figures |= _save(args, args.save, env, demos, earlier)
+    if dataset:
+      figures |= _save_dataset(args, args.save, env, demos)
+    else:
+      figures |= _save(args, args.save, env, demos, earlier)
   return figures
 
 
 def convert(args: Convert) -> Json:
   """Converts recorded joint trajectories into demonstrations."""
   if not args.out:
-    raise ConfigError("usage: apnpql convert REC.npz TASK OUT.npz")
+    raise ConfigError("usage: apnpql convert REC TASK OUT.npz")
   recording, out = Path(args.recording), Path(args.out)
   _check_demonstrations(out, overwrite=args.overwrite, append=args.append)
   if args.append and recording.resolve() == out.resolve():
@@ -148,12 +158,15 @@ def convert(args: Convert) -> Json:
   env = task_env(args.task)
 
   from apnpql_jax import devices, tasks
-  from apnpql_jax.data import demonstrations, real_arm
+  from apnpql_jax.data import demonstrations, lerobot, real_arm
+  from apnpql_jax.data.lerobot import conversion
 
   devices.start()
   earlier = _earlier(out, env) if args.append else None
   task = tasks.make_task(env.task)
-  if demonstrations.is_demonstrations(recording):
+  if lerobot.is_dataset(recording):
+    demos = conversion.convert(recording, task.scene, period_s=env.control_period_s)
+  elif demonstrations.is_demonstrations(recording):
     demos = demonstrations.load(recording, task, env, allow_unsolved=True)
   else:
     demos = real_arm.convert(recording, task.scene, period_s=env.control_period_s)
@@ -258,6 +271,19 @@ def _check_demonstrations(path: Path, *, overwrite: bool, append: bool) -> None:
   check_free(path, overwrite=overwrite or append)
 
 
+def _check_dataset(path: Path, *, append: bool) -> None:
+  """Raises ``UserError`` if a dataset cannot be written."""
+  if append:
+    raise ConfigError("--append needs --format npz; name a new folder for a dataset")
+  if path.is_file() or path.is_dir() and any(path.iterdir()):
+    raise ConfigError(f"{path} exists; name a new folder for the dataset")
+  check_writable(path)
+
+  from apnpql_jax.data import lerobot
+
+  lerobot.check_available()
+
+
 def _earlier(path: Path, env: EnvConfig) -> Demonstrations | None:
   """Returns the demonstrations in a file, or None if there is no file."""
   from apnpql_jax import tasks
@@ -289,6 +315,20 @@ def _save(
   counts = demonstrations.save(path, demos, task=env.task, control_period_s=period_s)
   solved = int(demonstrations.solved(demos, task, env).sum())
   return counts | {"solved_demonstrations": solved}
+
+
+def _save_dataset(
+  args: Collect, path: Path, env: EnvConfig, demos: Demonstrations
+) -> Json:
+  """Writes demonstrations as a dataset; returns the folder and its counts."""
+  from apnpql_jax import tasks
+  from apnpql_jax.data import demonstrations
+  from apnpql_jax.training.expert_dataset import write_dataset
+
+  task = tasks.make_task(env.task)
+  if args.solved_only:
+    demos = demonstrations.only_solved(demos, task, env)
+  return write_dataset(path, demos, task, env)
 
 
 def check_free(path: Path | None, *, overwrite: bool) -> None:

@@ -21,6 +21,7 @@ from apnpql_jax.cli.export import Export, export
 from apnpql_jax.cli.new_task import NewTask, new_task
 from apnpql_jax.cli.options import Train, parse
 from apnpql_jax.cli.plot import Plot, plot
+from apnpql_jax.cli.robot import Robot, robot
 from apnpql_jax.cli.sweep import Sweep, parse_sweep, sweep
 from apnpql_jax.cli.transfer import Transfer, transfer
 from apnpql_jax.config import files
@@ -193,6 +194,7 @@ _COMMANDS: dict[str, tuple[type[Any], Callable[[Any], Json]]] = {
   "watch": (watch.Watch, watch.watch),
   "export": (Export, export),
   "transfer": (Transfer, transfer),
+  "robot": (Robot, robot),
   "collect": (options.Collect, commands.collect),
   "convert": (options.Convert, commands.convert),
   "repeat": (options.Repeat, commands.repeat),

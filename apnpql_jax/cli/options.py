@@ -182,6 +182,8 @@ class Collect(_Play):
   apnpql collect push_plate --video expert.mp4
 
   apnpql collect push_plate --episodes 200 --noise 0.03 --save mine.npz
+
+  apnpql collect push_plate --save mine --format lerobot
   """
 
   task: tyro.conf.Positional[str] = ""
@@ -195,7 +197,11 @@ class Collect(_Play):
 
   save: File = None
   """Also record as many episodes, started from training resets, to this demonstrations
-  file."""
+  file, or folder of a dataset."""
+
+  format: str = "npz"
+  """Format of --save: npz (demonstrations for training) or lerobot (a dataset with
+  videos, for LeRobot)."""
 
   append: Flag = False
   """Add the episodes to --save if it exists."""
@@ -206,7 +212,7 @@ class Collect(_Play):
 
 @dataclasses.dataclass(frozen=True)
 class Convert(Command):
-  """Converts a recording to demonstrations: apnpql convert REC.npz TASK OUT.npz.
+  """Converts a recording to demonstrations: apnpql convert REC TASK OUT.npz.
 
   apnpql convert recording.npz push_plate mine.npz
 
@@ -214,8 +220,8 @@ class Convert(Command):
   """
 
   recording: tyro.conf.Positional[str] = ""
-  """Joint trajectories and object poses (docs/demonstrations.md), or another
-  demonstrations file."""
+  """Joint trajectories and object poses (docs/demonstrations.md), another
+  demonstrations file, or the folder of a dataset of LeRobot."""
 
   task: tyro.conf.Positional[str] = ""
   """Task of the recording, or the path of its file; `apnpql list` shows all."""

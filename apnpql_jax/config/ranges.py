@@ -29,6 +29,9 @@ _MAX_ABSOLUTE = {
 """Upper limits in the units of the settings. Objects outside these limits fit neither
 the hand nor their goal."""
 
+WRIST_SHARE = 0.1
+"""Shift of the wrist camera, as a share of that of the global camera."""
+
 
 @dataclasses.dataclass(frozen=True)
 class RandomizationConfig:

@@ -136,6 +136,9 @@ class AgentConfig:
   prior_mean: str = "primitives"
   """Means of the prior: primitives (predicted) or learned (by the M-step)."""
 
+  gripper_offset: bool = codec.added(False, before=True)
+  """Whether the M-step adds to the primitives' logits of closing the gripper."""
+
   diagonal_covariance: bool = False
   """Use diagonal covariances in prior and policy."""
 

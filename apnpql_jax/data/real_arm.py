@@ -46,19 +46,31 @@ def convert(path: Path, scene: Scene, *, period_s: float) -> Demonstrations:
   """
   arrays = npz.read(path, limit=runtime.host_memory() or 1 << 32)
   try:
-    recorded = _read(arrays, scene)
-    variant, episode = recorded.pop("variant"), recorded.pop("episode")
-    starts = np.flatnonzero(np.append(True, episode[1:] != episode[:-1]))
-    parts = [
-      _episode({name: array[rows] for name, array in recorded.items()}, scene, period_s)
-      for rows in map(slice, starts, [*starts[1:], len(episode)])
-    ]
-    demos = demonstrations.join(*parts)
-    demos = demos._replace(variant=np.full(demos.instants, variant))
-    demonstrations.check(demos, scene)
+    return convert_arrays(arrays, scene, period_s=period_s)
   except UserError as error:
     raise FileError(f"{path}: {error}") from None
+
+
+def convert_arrays(
+  arrays: dict[str, np.ndarray], scene: Scene, *, period_s: float
+) -> Demonstrations:
+  """Samples the arrays of a recording every ``period_s``; see ``convert``."""
+  recorded = _read(arrays, scene)
+  variant, episode = recorded.pop("variant"), recorded.pop("episode")
+  starts = np.flatnonzero(np.append(True, episode[1:] != episode[:-1]))
+  parts = [
+    _episode({name: array[rows] for name, array in recorded.items()}, scene, period_s)
+    for rows in map(slice, starts, [*starts[1:], len(episode)])
+  ]
+  demos = demonstrations.join(*parts)
+  demos = demos._replace(variant=np.full(demos.instants, variant))
+  demonstrations.check(demos, scene)
   return demos._replace(variant=demos.variant.astype(np.int32))
+
+
+def tracked(scene: Scene) -> tuple[list[str], list[str]]:
+  """Returns the bodies and the joints of objects that a recording must cover."""
+  return list(_bodies(scene.model)), list(_joints(scene))
 
 
 def _read(arrays: dict[str, np.ndarray], scene: Scene) -> dict[str, np.ndarray]:

@@ -150,6 +150,7 @@ def sample(
     primitives_tm1=start.timestep.primitives,
     weight=valid.astype(reward.dtype),
     window=slots_at(window, world[:, None]) if windows else None,
+    expert_tm1=start.timestep.expert,
   )
 
 

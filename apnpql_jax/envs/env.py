@@ -57,13 +57,14 @@ class Env:
     mesh: Mesh | None = None,
     *,
     instants: int = 0,
+    imitated: bool = False,
   ):
-    """Builds the engine and the cameras; ``instants`` is L of ``EnvState.recent``."""
+    """Builds the engine and the cameras; see ``make_env``."""
     scene = task.scene
     self.config, self.task, self.mesh = config, task, mesh
     substeps = _substeps(config, scene)
     self.physics = engines.make_physics(config.backend, scene, substeps=substeps)
-    self._bank, self._instants = bank, instants
+    self._bank, self._instants, self._imitated = bank, instants, imitated
     self._chain = arm.make_chain(scene)
     self._kinematics = make_kinematics(scene)
     self._cameras = make_cameras(config, scene) if config.obs == "pixels" else ()
@@ -78,7 +79,8 @@ class Env:
     """Returns the same worlds without a mesh, for evaluations and videos."""
     if self.mesh is None:
       return self
-    return Env(self.config, self.task, self._bank, instants=self._instants)
+    parts = self.config, self.task, self._bank
+    return Env(*parts, instants=self._instants, imitated=self._imitated)
 
   @property
   def bank_split(self) -> int:
@@ -215,14 +217,18 @@ class Env:
     # An episode cannot end at its first instant.
     solved = self.task.success(state, kinematics) & ~fresh
     late = (arrival.elapsed >= self.config.episode_steps) & ~fresh
+    primitives = jnp.concatenate(
+      [tracking.follow(targets, q[:, None]), close[..., None]], axis=-1
+    )
     timestep = TimeStep(
       observation=self._observation(state, kinematics, fresh, arrival.history),
       reward=solved.astype(jnp.float32),
       terminated=solved,
       truncated=late & ~solved,
-      primitives=jnp.concatenate(
-        [tracking.follow(targets, q[:, None]), close[..., None]], axis=-1
-      ),
+      primitives=primitives,
+      expert=self.task.expert(state, kinematics, primitives)
+      if self._imitated
+      else None,
     )
     return EnvState(state, targets, arrival.elapsed, timestep, arrival.faults)
 
@@ -249,6 +255,7 @@ def make_env(
   mesh: Mesh | None = None,
   *,
   instants: int = 0,
+  imitated: bool = False,
   bank_seed: int = reset_bank.SEED,
 ) -> Env:
   """Builds the worlds of ``config.task``, and its reset bank on first use.
@@ -256,7 +263,9 @@ def make_env(
   Args:
     config: Settings of the environment.
     mesh: Devices that share the worlds; the default device if None.
-    instants: ``agent.lstm_instants`` of the agent that acts in it.
+    instants: ``agent.lstm_instants`` of the agent that acts in it: L of
+      ``EnvState.recent``.
+    imitated: Whether ``TimeStep.expert`` is wanted.
     bank_seed: Seed of the reset states; training uses the default.
 
   Raises:
@@ -271,7 +280,7 @@ def make_env(
   if config.obs == "pixels":
     make_cameras(config, task.scene)
   bank, _ = reset_bank.load_bank(task, config.bank_rows, seed=bank_seed)
-  return Env(config, task, bank, mesh, instants=instants)
+  return Env(config, task, bank, mesh, instants=instants, imitated=imitated)
 
 
 def observation_shapes(config: EnvConfig, task: Task, *, instants: int) -> Observation:

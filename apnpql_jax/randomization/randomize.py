@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 import numpy as np
 
-from apnpql_jax.config.ranges import RandomizationConfig
+from apnpql_jax.config.ranges import WRIST_SHARE, RandomizationConfig
 from apnpql_jax.randomization import objects, visuals
 from apnpql_jax.randomization.draw import Draw, World
 from apnpql_jax.sim.motors import GRIPPER_SPEED
@@ -24,7 +24,6 @@ from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
 
-WRIST_SHARE = 0.1  # shift of the wrist camera, as a share of that of the global camera
 SEEN = (
   "color texture light_turn light_level camera_shift camera_turn field_of_view"
 ).split()

@@ -30,6 +30,9 @@ DEVIATION = 0.05
 MARGIN = 0.002
 """Distance from the workspace box that is kept, m; above the error of its samples."""
 
+_STILL = 1e-6
+"""Joint velocity below which a command stands still, rad/s."""
+
 _WAY = (0.0, 0.25, 0.5, 0.75, 1.0)
 """Parts of a braking distance at which the tool must be inside the workspace box."""
 
@@ -105,6 +108,7 @@ class MotionLimiter:
       velocity: Proposed joint velocities f64[6], rad/s; brakes if not finite.
       measured: Joint angles of the arm f64[6], which the command stays close to. This
         may take more than the acceleration limit, but never more than the velocity.
+        NaN if they are not known.
       yielding: The motion gives way to a contact, with up to ``braking``.
     """
     if not np.isfinite(velocity).all():
@@ -126,7 +130,7 @@ class MotionLimiter:
   @property
   def at_rest(self) -> bool:
     """Whether the command stands still."""
-    return not self.velocity.any()
+    return bool(np.abs(self.velocity).max() < _STILL)
 
   def _slower(self, deceleration: float) -> np.ndarray:
     """Returns the velocity after a cycle of braking on a straight line of joints."""

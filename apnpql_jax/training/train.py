@@ -232,7 +232,8 @@ def _start(
     about = weights.origin
     _print_line(f"starting with the weights of {about['run']}, step {about['step']:,}")
   agent = make_agent(config.agent)  # Before the worlds, which can take minutes.
-  env = make_env(config.env, mesh, instants=config.agent.lstm_instants)
+  instants, imitated = config.agent.lstm_instants, table_one.imitates(config.agent)
+  env = make_env(config.env, mesh, instants=instants, imitated=imitated)
   example = example_state(config, env, agent)
   devices.check_memory(needed_memory(example), "the training")
   if warning := run_folder.check_disk(run_dir, *disk_bytes(config, example, saved)):

@@ -14,15 +14,14 @@ import numpy as np
 
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.render import Lighting
+from apnpql_jax.sim.graphics import area_resized, off_screen
 from apnpql_jax.sim.scene import Scene, compile_file
 from apnpql_jax.transfer import looks
 from apnpql_jax.transfer.graphics import (
   CAMERAS,
   OVERSAMPLING,
-  area_resized,
   color_bytes,
   light_of,
-  off_screen,
 )
 
 SHADOW_SIZE = 512

@@ -21,13 +21,13 @@ from scipy.spatial.transform import Rotation
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.render import Geoms
+from apnpql_jax.sim.graphics import area_resized
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.transfer import looks
 from apnpql_jax.transfer.bullet import connect
 from apnpql_jax.transfer.graphics import (
   CAMERAS,
   OVERSAMPLING,
-  area_resized,
   color_bytes,
   given,
   light_of,

@@ -2,8 +2,8 @@
 
   python -m benchmarks.peers.stable_baselines --store
 
-Both see the same observations, start from as many transitions of the scripted expert,
-and play the same held-out episodes. SAC has the defaults of the library, in worlds that
+Both see the same observations, have as many transitions of the scripted expert, and
+play the same held-out episodes. SAC is that of ``apnpql_jax.gym.sac``, in worlds that
 one program steps. Ours is the preset. Minutes count from the start of learning, with
 evaluations; imports, compilation and the expert's play come before.
 """
@@ -16,16 +16,14 @@ import tempfile
 import time
 from typing import Any
 
-import numpy as np
-
 from apnpql_jax import runtime, testing
 from apnpql_jax.config.files import load_preset
 from apnpql_jax.training.train import train
 from benchmarks.common import command, settings
 
 TASK, SOLVED = "push_plate", 0.8
+EVAL_EVERY = 2_560
 _RATE = "eval/success_rate"
-SAC = {"learning_starts": 0, "train_freq": 1, "buffer_size": 300_000}
 
 
 def main() -> None:
@@ -54,28 +52,22 @@ def measure_all(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 def sac(args: argparse.Namespace) -> list[dict[str, float]]:
   """Trains SAC until it has solved 80 % or its time is over."""
-  from stable_baselines3 import SAC as Learner
   from stable_baselines3.common.callbacks import BaseCallback
 
-  from apnpql_jax.gym.stable_baselines import StableBaselinesVecEnv
+  from apnpql_jax.gym.sac import held_out_worlds, make_sac, success_rate
 
-  preset = load_preset(TASK)
-  shared: dict[str, Any] = {"obs": "state", "bank_rows": preset.env.bank_rows}
-  worlds = StableBaselinesVecEnv(TASK, args.worlds, **shared)
-  held_out = StableBaselinesVecEnv(TASK, args.episodes, held_out=True, **shared)
-  options: dict[str, Any] = SAC | {"gradient_steps": args.updates, "seed": args.seed}
-  learner = Learner("MultiInputPolicy", worlds, **options)
-  fill(learner, worlds, preset.replay.expert_steps, preset.replay.expert_noise)
+  held_out = held_out_worlds(TASK, args.episodes)
+  learner = make_sac(TASK, worlds=args.worlds, updates=args.updates, seed=args.seed)
   curve: list[dict[str, float]] = []
 
   class Evaluations(BaseCallback):
-    """Evaluates every 5,000 steps; stops at the goal or when the time is over."""
+    """Evaluates as often as ours; stops at the goal or when the time is over."""
 
     def _on_training_start(self) -> None:
       self.began = time.monotonic()
 
     def _on_step(self) -> bool:
-      if self.num_timesteps // 5_000 > len(curve):
+      if self.num_timesteps // EVAL_EVERY > len(curve):
         rate = success_rate(learner, held_out)
         minutes = (time.monotonic() - self.began) / 60
         point = {"steps": self.num_timesteps, "minutes": minutes, "success_rate": rate}
@@ -95,7 +87,9 @@ def ours(args: argparse.Namespace) -> list[dict[str, float]]:
   if not args.quick:
     config = settings.changed(load_preset(TASK), "env", obs="state")
   episodes, never = args.episodes, 10**9
-  config = dataclasses.replace(config, seed=args.seed, video=False, eval_every=2_560)
+  config = dataclasses.replace(
+    config, seed=args.seed, video=False, eval_every=EVAL_EVERY
+  )
   config = dataclasses.replace(config, eval_episodes=episodes, checkpoint_every=never)
   with tempfile.TemporaryDirectory() as folder:
     run = Path(folder) / "run"
@@ -106,36 +100,6 @@ def ours(args: argparse.Namespace) -> list[dict[str, float]]:
     {new: row[old] for old, new in names.items()} for row in rows if _RATE in row
   ]
   return [point | {"minutes": point["minutes"] / 60} for point in curve]
-
-
-def fill(learner: Any, worlds: Any, transitions: int, noise: float) -> None:
-  """Puts transitions of the scripted expert into the replay of SAC."""
-  rng, observation = np.random.default_rng(0), worlds.reset()
-  for _ in range(transitions // worlds.num_envs):
-    action = worlds.worlds.expert_action()
-    action[:, :-1] += noise * rng.standard_normal(action[:, :-1].shape)
-    action = action.clip(-1.0, 1.0)
-    after, reward, done, infos = worlds.step(action)
-    follows = {name: x.copy() for name, x in after.items()}
-    for world in np.flatnonzero(done):
-      for name, x in infos[world]["terminal_observation"].items():
-        follows[name][world] = x
-    learner.replay_buffer.add(observation, follows, action, reward, done, infos)
-    observation = after
-
-
-def success_rate(learner: Any, worlds: Any) -> float:
-  """Returns the share of worlds whose first episode is solved."""
-  worlds.seed(0)
-  observation = worlds.reset()
-  solved, over = np.zeros(worlds.num_envs, bool), np.zeros(worlds.num_envs, bool)
-  while not over.all():
-    action, _ = learner.predict(observation, deterministic=True)
-    observation, _, done, infos = worlds.step(action)
-    success = np.array([info["success"] for info in infos])
-    solved |= success & ~over
-    over |= done
-  return float(solved.mean())
 
 
 ROWS = {"sac": sac, "apnpql": ours}

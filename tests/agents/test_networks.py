@@ -401,6 +401,22 @@ def test_prior_keeps_its_floors_and_limits():
   assert close.max() == pytest.approx(0.95, abs=1e-3)
 
 
+def test_without_an_offset_the_gripper_is_that_of_the_primitives():
+  rng = np.random.default_rng(4)
+  outputs, primitives = rng.normal(size=(20, 3 * 23)), rng.normal(size=(20, 3, 7))
+  limits: Any = {"min_std": 0.05, "initial_std": 0.2, "max_std": 0.5, "min_prob": 0.2}
+  given = [jnp.asarray(3.0 * x, jnp.float32) for x in (outputs, primitives)]
+  with_offset, without = (
+    mixture_from_outputs(*given, num=3, gripper_offset=offset, **limits)
+    for offset in (True, False)
+  )
+  expected = np.clip(3.0 * primitives[..., 6], -np.log(4.0), np.log(4.0))
+  np.testing.assert_allclose(without.gripper_logits, expected, rtol=1e-5)
+  assert np.abs(with_offset.gripper_logits - expected).max() > 1.0
+  np.testing.assert_array_equal(with_offset.logits, without.logits)
+  np.testing.assert_array_equal(with_offset.scale_tril, without.scale_tril)
+
+
 def test_a_limit_lets_the_gradient_back_in():
   x = jnp.array([-3.0, -1.0, 0.5, 1.0, 3.0])
   np.testing.assert_array_equal(

@@ -41,6 +41,7 @@ TRAINS = {
   "mpo": VALUE | ALPHA | POLICY,
   "sac": VALUE | ALPHA | POLICY,
   "ap_cem": VALUE | ALPHA | PRIOR,
+  "ap_dagger": VALUE | ALPHA | PRIOR,
 }
 """Row -> loss -> parameters that it trains, by the paper's names of its arguments."""
 
@@ -65,6 +66,7 @@ COLUMNS = {
   "mpo": Columns("past", "pi", None, "forward", 1, windows=True),
   "sac": Columns("uniform", "pi", None, "reverse", 2),
   "ap_cem": Columns("b", "cem", "q", "none", 2),
+  "ap_dagger": Columns("b", "b", "expert", "none", SMALL.num_atoms),
 }
 
 
@@ -200,6 +202,9 @@ def test_losses_are_those_of_the_candidates_that_the_row_names(name: str):
     # By draws of its own, not those of the policy update.
     key = jax.random.fold_in(KEY, 1)
     candidates["good"] = of_good(heads, example.batch.action_tm1, key)
+  if columns.fitted_to == "expert":
+    assert example.batch.expert_tm1 is not None
+    candidates["expert"] = example.batch.expert_tm1[None], np.ones((1, BATCH))
   if columns.fitted_to:
     samples, weights = candidates[columns.fitted_to]
     fit = -np.sum(weights * log_prob(prior, samples), axis=0)
@@ -217,8 +222,8 @@ def test_actions_are_those_of_the_policy_that_the_row_names(name: str):
   act = jax.jit(example.agent.act)
   _, info = act(example.trained, example.batch.observation_tm1, KEY)
   kind = COLUMNS[name].policy
-  if kind == "cem":
-    expected = np.ones(BATCH)
+  if kind in ("cem", "b"):
+    expected = np.full(BATCH, 1.0 if kind == "cem" else SMALL.policy_samples)
   else:
     drawn = of_pi(heads, key) if kind == "pi" else of_q(heads, heads.prior(), key)
     expected = 1.0 / np.sum(drawn[1] ** 2, axis=0)

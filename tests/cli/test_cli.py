@@ -97,7 +97,7 @@ BAD_INPUT = [
   ("evaluate runs/old --checkpoint ²", ["'²'", "newest", "best"]),
   (f"evaluate runs/old --checkpoint {5000 * '9'}", ["newest", "best"]),
   ("evaluate runs/old", ["no checkpoint"]),
-  ("convert", ["REC.npz", "TASK", "OUT.npz"]),
+  ("convert", ["REC", "TASK", "OUT.npz"]),
   ("convert none.npz juggle out.npz", ["'juggle'", "push_plate"]),
   ("convert none.npz push_plate out.npz", ["cannot read none.npz"]),
   ("repeat", ["RUN/faults/step_<n>.npz"]),

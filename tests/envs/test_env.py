@@ -89,6 +89,13 @@ def test_density_of_the_expert_is_that_of_its_noise(env, noise: float):
   assert np.all(np.asarray(log_prob) > 60.0) == (noise == 0.0)
 
 
+def test_the_action_of_the_expert_is_a_label_where_it_is_imitated(env):
+  imitated = Env(env.config, env.task, env._bank, imitated=True)
+  state = imitated.reset(jnp.arange(4))
+  np.testing.assert_array_equal(state.timestep.expert, env.expert_action(state))
+  assert env.reset(jnp.arange(4)).timestep.expert is None
+
+
 def test_time_out_truncates_then_resets(env):
   """Three periods, then a terminal instant, then the first instant of a new episode."""
   short = Env(SHORT, env.task, env._bank)

@@ -19,7 +19,7 @@ import pytest
 
 from apnpql_jax import errors, testing
 from apnpql_jax.agents.learner import make_agent
-from apnpql_jax.agents.table_one import ALGORITHMS
+from apnpql_jax.agents.table_one import ALGORITHMS, imitates
 from apnpql_jax.cli import main
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.data import replay
@@ -73,7 +73,9 @@ def built(request) -> Built:
     agent=agent,
     max_skipped_updates=2,
   )
-  env, agent = make_env(config.env, instants=instants), make_agent(config.agent)
+  imitated = imitates(config.agent)
+  env = make_env(config.env, instants=instants, imitated=imitated)
+  agent = make_agent(config.agent)
   state = initial_state(config, env, agent, collect_expert)
   assert all(x.committed for x in jax.tree.leaves(state))
   jitted: Any = make_iteration(config, env, agent)

@@ -22,6 +22,7 @@ from apnpql_jax.envs.state import EnvState
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.randomization.randomize import make_randomize
 from apnpql_jax.render import Lighting
+from apnpql_jax.sim.graphics import area_resized
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.sim.physics import START_TIME
 from apnpql_jax.sim.scene import Scene
@@ -31,7 +32,6 @@ from apnpql_jax.training.train import train
 from apnpql_jax.training.video import HOLD
 from apnpql_jax.transfer import film, looks
 from apnpql_jax.transfer.cell import Cell
-from apnpql_jax.transfer.graphics import area_resized
 from apnpql_jax.transfer.opengl import OpenGL
 from apnpql_jax.transfer.play import Played, play
 from apnpql_jax.transfer.tiny import Tiny

@@ -46,6 +46,19 @@ def non_parametric(
   return Candidates(samples, actions, outputs, q_values, weights, prior, 1.0 / alpha)
 
 
+def prior_alone(
+  heads: Heads,
+  prior: ActionDistribution,
+  key: PRNGKeyArray,
+  *,
+  num_samples: int,
+) -> Candidates:
+  """Samples b with equal weights, without regard to Q."""
+  drawn = non_parametric(heads, prior, key, num_samples=num_samples)
+  equal = jnp.full_like(drawn.weights, 1.0 / num_samples)
+  return drawn.replace(weights=equal, tilt=jnp.zeros_like(drawn.tilt))
+
+
 def parametric(
   heads: Heads,
   prior: ActionDistribution,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Float, PRNGKeyArray
 
 from apnpql_jax.agents import losses
@@ -69,6 +70,22 @@ def fit_advantageous(
   policy = parametric(heads, prior, key, num_samples=heads.config.policy_samples)
   good = heads.q(samples) >= policy.value[None]
   return _fit(heads, prior, samples, good.astype(samples.dtype), nu)
+
+
+def fit_expert(
+  heads: Heads,
+  prior: ActionDistribution,
+  candidates: Candidates,
+  batch: Transition,
+  key: PRNGKeyArray,
+  nu: Float[Array, ""],
+) -> Losses:
+  """Fits b to the scripted expert in all visited states (DAgger, Ross et al. 2011)."""
+  del candidates, key
+  if batch.expert_tm1 is None:
+    raise ValueError("the transitions lack the actions of the expert")
+  samples = batch.expert_tm1[None]
+  return _fit(heads, prior, samples, jnp.ones(samples.shape[:-1]), nu)
 
 
 def _fit(

@@ -1,0 +1,191 @@
+"""The command ``apnpql robot``."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+import sys
+from typing import Annotated, Any
+
+import tyro
+
+from apnpql_jax.cli.options import Command, File, Flag, default_hint
+from apnpql_jax.errors import ConfigError, check_name
+
+AsDefault = Annotated[str | None, default_hint("")]
+ACTIONS = ("check", "calibrate", "run")
+
+
+@dataclasses.dataclass(frozen=True)
+class Robot(Command):
+  """Runs an exported policy on an arm: apnpql robot ACTION [options].
+
+  ACTION is check (nothing moves), calibrate (cameras) or run (plays episodes).
+
+  apnpql robot check --robot ur5e --policy policy --cell robot.toml
+
+  apnpql robot run --robot simulated --policy policy --episodes 20
+  """
+
+  action: tyro.conf.Positional[str] = ""
+  """check, calibrate or run."""
+
+  robot: str = "simulated"
+  """ur5e; simulated: a MuJoCo plant behind the same runtime; double: servers that speak
+  the protocols of the devices."""
+
+  policy: File = None
+  """Folder of an exported policy, see `apnpql export`."""
+
+  cell: Annotated[Path, default_hint("(default: robot.toml)")] = Path("robot.toml")
+  """File that describes the cell, of ur5e."""
+
+  task: str = ""
+  """Task on the table, to refuse policies of others."""
+
+  episodes: int = 10
+  """Number of episodes."""
+
+  seed: int = 0
+  """Random seed of the policy and of simulated reset states."""
+
+  log: File = None
+  """Folder to make, for a dataset of LeRobot with what happened."""
+
+  replay: File = None
+  """Repeat the actions of a log instead of those of the policy."""
+
+  admittance: bool = True
+  """Give way to contacts."""
+
+  latency_ms: float = 0.0
+  """Delay of commands to a simulated arm."""
+
+  slowdown: float = 1.0
+  """Seconds per second of a simulated robot, for busy machines."""
+
+  yes: Flag = False
+  """Move a real arm without asking."""
+
+  views: Annotated[Path, default_hint("(default: views)")] = Path("views")
+  """Folder of the views of the board, for calibrate: to make, or with --recorded, to
+  read."""
+
+  recorded: Flag = False
+  """Calibrate from the views that are in the folder, without devices."""
+
+  board: AsDefault = None
+  """The printed board, for calibrate, such as 11x8:33.5:25:6x6_250."""
+
+  print_board: File = None
+  """Write the board as .pdf or .png to print it, for calibrate."""
+
+  board_on: str = "tool"
+  """Where the board is in views of the global camera: tool or table."""
+
+  overwrite: Flag = False
+  """Replace the calibration that exists."""
+
+
+def robot(args: Robot) -> dict[str, Any]:
+  """Checks, calibrates or runs a robot and returns the result."""
+  if not args.action:
+    raise ConfigError(f"robot needs an action: {', '.join(ACTIONS)}")
+  check_name("robot action", args.action, ACTIONS)
+
+  from apnpql_jax.robot import devices
+
+  devices.check_kind(args.robot)
+  _check_options(args)
+  if args.print_board is not None:
+    from apnpql_jax.robot.calibration import boards
+
+    board = boards.Board() if args.board is None else boards.parse(args.board)
+    return boards.print_board(board, args.print_board)
+  if args.policy is None:
+    raise ConfigError("robot needs --policy, the folder of an exported policy")
+
+  from apnpql_jax.robot import policy_folder, setup
+
+  policy = policy_folder.load(args.policy)
+  setup.check_task(policy, args.task)
+  opened = setup.describe(
+    args.robot, policy, args.cell, slowdown=args.slowdown, calibrate=_calibrates(args)
+  )
+  if args.action == "calibrate":
+    return _calibrate(args, opened)
+  with setup.doubled(opened) as opened:
+    if args.action == "check":
+      from apnpql_jax.robot.check import check
+
+      return check(opened, policy, admittance=args.admittance)
+    return _run(args, opened, policy)
+
+
+def _run(args: Robot, opened: Any, policy: Any) -> dict[str, Any]:
+  from apnpql_jax.robot.run import run
+  from apnpql_jax.robot.session import Options
+
+  if args.robot == "ur5e" and not args.yes:
+    _confirm(args)
+  return run(
+    opened,
+    policy,
+    Options(
+      seed=args.seed,
+      admittance=args.admittance,
+      latency_s=args.latency_ms / 1e3,
+      log=None if args.log is None else str(args.log.absolute()),
+      replay=None if args.replay is None else str(args.replay.absolute()),
+    ),
+    episodes=args.episodes,
+  )
+
+
+def _calibrate(args: Robot, opened: Any) -> dict[str, Any]:
+  """Calibrates the cameras of a cell; the arm only moves by hand."""
+  if (out := opened.cell.calibration) is None:
+    raise ConfigError("only the cameras of --robot ur5e need a calibration")
+  from apnpql_jax.robot.calibration import boards, live
+
+  return live.calibrate_cell(
+    opened.contract,
+    args.views,
+    out,
+    host=opened.cell.arm_host,
+    serials=opened.cell.cameras,
+    recorded=args.recorded,
+    board=boards.Board().text if args.board is None else args.board,
+    board_on=args.board_on,
+    overwrite=args.overwrite,
+  )
+
+
+def _calibrates(args: Robot) -> bool:
+  return args.action == "calibrate"
+
+
+def _check_options(args: Robot) -> None:
+  """Raises ``ConfigError`` for values that no robot takes."""
+  if args.episodes < 1 or not 0 <= args.seed < 2**32:
+    raise ConfigError("--episodes must be at least 1 and --seed from 0 to 2^32 - 1")
+  if not 0 <= args.latency_ms <= 500 or not 0.1 <= args.slowdown <= 100:
+    raise ConfigError("--latency-ms must be 0 to 500 and --slowdown 0.1 to 100")
+  if args.robot != "simulated" and (args.latency_ms, args.slowdown) != (0.0, 1.0):
+    raise ConfigError("--latency-ms and --slowdown need --robot simulated")
+
+
+def _confirm(args: Robot) -> None:
+  """Asks before a real arm moves.
+
+  Raises:
+    ConfigError: The answer is no, or nobody can answer.
+  """
+  if not sys.stdin or not sys.stdin.isatty():
+    raise ConfigError("a real arm would move; add --yes if nobody is asked")
+  sys.stderr.write(
+    f"The arm of {args.cell} will move. Keep the emergency stop at hand. Go on? [y/N] "
+  )
+  sys.stderr.flush()
+  if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+    raise ConfigError("nothing has moved")

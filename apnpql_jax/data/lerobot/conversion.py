@@ -1,0 +1,154 @@
+"""Demonstrations to the columns of a dataset, and back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from apnpql_jax.data import demonstrations, real_arm
+from apnpql_jax.data.demonstrations import Demonstrations
+from apnpql_jax.data.lerobot.layout import ENVIRONMENT
+from apnpql_jax.data.lerobot.reader import Dataset, read
+from apnpql_jax.errors import FileError, UserError
+from apnpql_jax.sim.scene import ARM_JOINTS, GRIPPER_JOINT, Scene
+
+_POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
+_TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
+_FREE, _BALL = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
+_VARIANT = "variant"
+_PERIOD_TOLERANCE = 1e-3  # of a control period
+
+
+def state_names(scene: Scene) -> list[str]:
+  """Returns the names of the numbers in a state: positions, velocities, variant."""
+  return [*_position_names(scene.model), *_velocity_names(scene.model), _VARIANT]
+
+
+def states(demos: Demonstrations) -> np.ndarray:
+  """Returns the states f32[n, k] of demonstrations, in the order of ``state_names``."""
+  mocap = np.concatenate([demos.mocap_pos, demos.mocap_quat], axis=-1)
+  mocap = mocap.reshape(demos.instants, -1)
+  variant = demos.variant[:, None].astype(np.float32)
+  parts = [demos.qpos, mocap, demos.qvel, variant]
+  return np.concatenate(parts, axis=1).astype(np.float32)
+
+
+def convert(folder: Path, scene: Scene, *, period_s: float) -> Demonstrations:
+  """Reads a dataset as demonstrations.
+
+  A dataset with whole states, as ``apnpql collect`` writes it, gives the demonstrations
+  that it was made from. One with poses only is converted like a recording, see
+  ``real_arm``.
+
+  Raises:
+    FileError: The folder is no dataset, is damaged, holds no poses of the objects, or
+      does not fit the scene.
+  """
+  dataset = read(folder)
+  try:
+    if not dataset.episodes:
+      raise FileError("it has no episodes")
+    names = dataset.names.get(ENVIRONMENT)
+    if names is None:
+      raise FileError(
+        f"it has no {ENVIRONMENT}, the poses of the objects, from which rewards, "
+        "labels and images are computed"
+      )
+    if set(names) >= set(state_names(scene)):
+      return _exact(dataset, scene, period_s)
+    return _from_poses(dataset, scene, period_s)
+  except UserError as error:
+    raise FileError(f"{str(folder)!r}: {error}") from None
+
+
+def _exact(dataset: Dataset, scene: Scene, period_s: float) -> Demonstrations:
+  """Returns demonstrations from whole states, one control period apart."""
+  if abs(1 / (dataset.fps * period_s) - 1) > _PERIOD_TOLERANCE:
+    raise FileError(
+      f"its frames are {1 / dataset.fps:.4g} s apart, not {period_s} s, the control "
+      "period of the task"
+    )
+  model, rows = scene.model, _column(dataset, state_names(scene)).astype(np.float32)
+  ends = np.cumsum([model.nq, 7 * model.nmocap, model.nv])
+  qpos, mocap, qvel, variant = np.split(rows, ends, axis=1)
+  mocap = mocap.reshape(len(rows), model.nmocap, 7)
+  action = np.concatenate([x.actions for x in dataset.episodes])
+  first = np.concatenate([x.time == 0 for x in dataset.episodes])
+  demos = Demonstrations(
+    qpos=qpos,
+    qvel=qvel,
+    mocap_pos=mocap[..., :3],
+    mocap_quat=mocap[..., 3:],
+    variant=variant[:, 0].astype(np.int32),
+    action=action.astype(np.float32),
+    first=first,
+  )
+  demonstrations.check(demos, scene)
+  return demos
+
+
+def _from_poses(dataset: Dataset, scene: Scene, period_s: float) -> Demonstrations:
+  """Returns demonstrations from joint angles and poses of objects."""
+  bodies, joints = real_arm.tracked(scene)
+  known = dataset.names[ENVIRONMENT]
+  arrays = {
+    "time": np.concatenate([x.time for x in dataset.episodes]),
+    "joints": np.concatenate([x.joints for x in dataset.episodes]),
+    "gripper": np.concatenate([x.gripper for x in dataset.episodes]),
+    "episode": np.repeat(
+      np.arange(len(dataset.episodes)), [len(x.time) for x in dataset.episodes]
+    ),
+    "time_unit": np.array("s"),
+    "angle_unit": np.array("rad"),
+    "length_unit": np.array("m"),
+    "quaternion_order": np.array("wxyz"),
+    "frame": np.array("world"),
+    "joint_names": np.array(ARM_JOINTS),
+    "gripper_range": scene.model.joint(GRIPPER_JOINT).range,
+  }
+  columns = {body: [f"{body}.{x}" for x in _POSE] for body in bodies}
+  columns |= {joint: [f"{joint}.position"] for joint in joints}
+  for name, wanted in columns.items():
+    if set(wanted) <= set(known):
+      values = _column(dataset, wanted)
+      arrays[name] = values if name in bodies else values[:, 0]
+  return real_arm.convert_arrays(arrays, scene, period_s=period_s)
+
+
+def _column(dataset: Dataset, names: list[str]) -> np.ndarray:
+  """Returns numbers of the states of all episodes, by name, f64[n, len(names)]."""
+  index = [dataset.names[ENVIRONMENT].index(name) for name in names]
+  return np.concatenate([x.columns[ENVIRONMENT][:, index] for x in dataset.episodes])
+
+
+def _position_names(model: mujoco.MjModel) -> list[str]:
+  """Returns names of qpos, then of the poses of mocap bodies."""
+  names = []
+  for i in range(model.njnt):
+    kind, joint = model.jnt_type[i], _joint_name(model, i)
+    if kind == _FREE:
+      names += [f"{model.body(model.jnt_bodyid[i]).name}.{x}" for x in _POSE]
+    else:
+      ball = kind == _BALL
+      names += [f"{joint}.{x}" for x in (_POSE[3:] if ball else ("position",))]
+  bodies = np.argsort(model.body_mocapid)[model.nbody - model.nmocap :]
+  return [*names, *(f"{model.body(i).name}.{x}" for i in bodies for x in _POSE)]
+
+
+def _velocity_names(model: mujoco.MjModel) -> list[str]:
+  """Returns names of qvel."""
+  names = []
+  for i in range(model.njnt):
+    kind, joint = model.jnt_type[i], _joint_name(model, i)
+    if kind == _FREE:
+      names += [f"{model.body(model.jnt_bodyid[i]).name}.{x}" for x in _TWIST]
+    else:
+      ball = kind == _BALL
+      names += [f"{joint}.{x}" for x in (_TWIST[3:] if ball else ("velocity",))]
+  return names
+
+
+def _joint_name(model: mujoco.MjModel, joint: int) -> str:
+  return model.joint(joint).name or f"joint_{joint}"

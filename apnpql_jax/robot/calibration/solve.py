@@ -1,0 +1,228 @@
+"""The pose of a camera from views of a board; see ``problem`` for the equation."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from apnpql_jax.errors import ConfigError
+from apnpql_jax.robot.calibration.boards import opencv
+from apnpql_jax.robot.calibration.problem import (
+  Problem,
+  angle_deg,
+  deviations,
+  refine,
+  rms,
+)
+
+FEWEST_VIEWS = 8
+LEAST_TURN_DEG = 10.0
+"""How far the flange must turn about a second axis (root mean square over all pairs of
+views): from turns about one axis, the position along it does not follow."""
+
+OUTLIER_MRAD = 3.0  # a view's error above this, seen from the camera, and
+OUTLIER_FACTOR = 4.0  # above this many times the median, is an outlier's
+MOST_OUTLIERS = 0.4  # share of the views
+MOST_MRAD = 10.0  # median error of the views; 4 mm at a distance of 0.4 m
+LARGEST_SCALE_ERROR = 0.01  # of the printed board
+_FOLDS = 4
+_SUBSETS, _SUBSET = 40, 6  # random choices of views for the first guess
+
+
+@dataclasses.dataclass(frozen=True)
+class Solution:
+  """The pose of a camera and how well it explains the views."""
+
+  camera: np.ndarray  # X
+  board: np.ndarray  # Y
+  kept: np.ndarray  # bool[views]: not an outlier
+  method: str  # that gave the first guess
+  residuals: dict[str, Any]
+
+
+def solve(problem: Problem) -> Solution:
+  """Returns the poses of camera and board from views at several flange poses.
+
+  Raises:
+    ConfigError: There are too few views, they turn too little, most of them contradict
+      each other, or the board has another size than it should.
+  """
+  check_motion(problem)
+  poses = np.stack([problem.lens.board_pose(problem.board, x) for x in problem.seen])
+  camera, board, method = _first_guess(problem, poses)
+  camera, board, kept = _without_outliers(problem, camera, board)
+  good = problem.select(np.flatnonzero(kept))
+  check_motion(good)
+  _check_scale(good, camera, board)
+  residuals = _residuals(good, poses[kept], camera, board)
+  residuals |= {"views": int(kept.sum()), "outliers": np.flatnonzero(~kept).tolist()}
+  return Solution(camera, board, kept, method, residuals)
+
+
+def solve_fixed(problem: Problem, board: np.ndarray) -> Solution:
+  """Returns the pose of a fixed camera that sees a board at a known pose.
+
+  Raises:
+    ConfigError: The views contradict each other.
+  """
+  poses = np.stack([problem.lens.board_pose(problem.board, x) for x in problem.seen])
+  guesses = [board @ np.linalg.inv(pose) for pose in poses]
+  medians = [np.median(problem.error_of_views(x, board)) for x in guesses]
+  camera = guesses[int(np.argmin(medians))]
+  camera, board, kept = _without_outliers(problem, camera, board, fixed=True)
+  good = problem.select(np.flatnonzero(kept))
+  residuals: dict[str, Any] = _consistency(good, poses[kept], camera, board)
+  residuals |= {"views": int(kept.sum()), "outliers": np.flatnonzero(~kept).tolist()}
+  return Solution(camera, board, kept, "PnP", residuals)
+
+
+def check_motion(problem: Problem) -> None:
+  """Checks that views suffice for a hand-eye calibration.
+
+  Raises:
+    ConfigError: They are too few, or do not turn about two axes.
+  """
+  count = len(problem.seen)
+  if count < FEWEST_VIEWS:
+    raise ConfigError(
+      f"{count} views show the board, but at least {FEWEST_VIEWS} are needed, better 15"
+    )
+  turns = Rotation.from_matrix(problem.motion[:, :3, :3])
+  pairs = [(turns[i].inv() * turns[i + 1 :]).as_rotvec() for i in range(count - 1)]
+  vectors = np.concatenate(pairs)
+  moments = np.linalg.eigvalsh(vectors.T @ vectors / len(vectors))
+  first, second = np.degrees(np.sqrt(np.maximum(moments[::-1][:2], 0.0)))
+  if second < LEAST_TURN_DEG:
+    raise ConfigError(
+      f"the flange turns {first:.1f} degrees about one axis and {second:.1f} about a "
+      f"second, of which at least {LEAST_TURN_DEG:.0f} are needed: tilt it in two "
+      "directions and turn it between views"
+    )
+
+
+def _first_guess(
+  problem: Problem, poses: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, str]:
+  """Returns X, Y and the name of OpenCV's solver with the least median error.
+
+  Each solver gets all views, and random choices, of which some have no outliers.
+  """
+  cv2 = opencv()
+  solvers = {
+    name: getattr(cv2, f"CALIB_HAND_EYE_{name}")
+    for name in ("TSAI", "PARK", "HORAUD", "ANDREFF", "DANIILIDIS")
+  }
+  rng, count = np.random.default_rng(0), len(poses)
+  subsets = [np.arange(count)]
+  subsets += [rng.permutation(count)[:_SUBSET] for _ in range(_SUBSETS)]
+  hands = np.linalg.inv(problem.motion)
+  best: tuple[float, Any, Any, str] = (np.inf, None, None, "")
+  for index, rows in enumerate(subsets):
+    for name, method in solvers.items():
+      if index and name != "PARK":
+        continue
+      try:
+        turn, shift = cv2.calibrateHandEye(
+          hands[rows, :3, :3],
+          hands[rows, :3, 3],
+          poses[rows, :3, :3],
+          poses[rows, :3, 3],
+          method=method,
+        )
+      except cv2.error:
+        continue  # Another solver may take these views.
+      camera = np.eye(4)
+      camera[:3, :3], camera[:3, 3] = turn, shift.ravel()
+      if not np.isfinite(camera).all() or np.linalg.det(turn) < 0.5:
+        continue
+      board = _mean_pose(hands[rows] @ camera @ poses[rows])
+      error = float(np.median(problem.error_of_views(camera, board)))
+      if error < best[0]:
+        best = error, camera, board, name
+  if best[1] is None:
+    raise ConfigError("no solver finds a pose: take new views")
+  return best[1:]
+
+
+def _without_outliers(
+  problem: Problem, camera: np.ndarray, board: np.ndarray, *, fixed: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+  """Refines the poses, leaves out views that contradict them, and refines again."""
+  kept, px_per_mrad = np.ones(len(problem.seen), bool), problem.lens.fx / 1e3
+  camera, board, _ = refine(problem, camera, board, fixed=fixed, robust=True)
+  for _ in range(5):
+    error = problem.error_of_views(camera, board)
+    limit = max(OUTLIER_MRAD * px_per_mrad, OUTLIER_FACTOR * float(np.median(error)))
+    before, kept = kept, error < limit
+    if len(kept) - kept.sum() > MOST_OUTLIERS * len(kept):
+      break
+    good = problem.select(np.flatnonzero(kept))
+    camera, board, _ = refine(good, camera, board, fixed=fixed)
+    if (kept == before).all():
+      break
+  median = float(np.median(problem.error_of_views(camera, board)))
+  if median > MOST_MRAD * px_per_mrad or (~kept).mean() > MOST_OUTLIERS:
+    raise ConfigError(
+      f"the views contradict each other by {median:.1f} pixels (median): check that "
+      "the board did not move, that joint angles belong to their images and are in "
+      "rad, and that the board is the one named"
+    )
+  return camera, board, kept
+
+
+def _check_scale(problem: Problem, camera: np.ndarray, board: np.ndarray) -> None:
+  """Checks the size of the board against the motion of the arm."""
+  _, _, found = refine(problem, camera, board, scaled=True)
+  scale, deviation = 1.0 + found.x[-1], deviations(found)[-1]
+  if abs(scale - 1.0) > max(LARGEST_SCALE_ERROR, 3 * deviation):
+    raise ConfigError(
+      f"by the motion of the arm, the board's squares measure "
+      f"{scale * problem.board.square_mm:.2f} mm, not {problem.board.square_mm:g}: "
+      "measure the print, and name its size or print it at 100 %"
+    )
+
+
+def _residuals(
+  problem: Problem, poses: np.ndarray, camera: np.ndarray, board: np.ndarray
+) -> dict[str, Any]:
+  """Returns errors on all views, on views that were held out, and uncertainties."""
+  _, _, found = refine(problem, camera, board)
+  deviation = deviations(found)
+  rows, held_out = np.arange(len(poses)), []
+  for fold in range(_FOLDS):
+    test = rows % _FOLDS == fold
+    cameras = refine(problem.select(rows[~test]), camera, board)[:2]
+    held_out.append(_consistency(problem.select(rows[test]), poses[test], *cameras))
+  return _consistency(problem, poses, camera, board) | {
+    "held_out": {
+      name: float(np.sqrt(np.mean([x[name] ** 2 for x in held_out])))
+      for name in held_out[0]
+    },
+    "deviation_mm": float(1e3 * np.linalg.norm(deviation[:3])),
+    "deviation_deg": float(np.degrees(np.linalg.norm(deviation[3:6]))),
+  }
+
+
+def _consistency(
+  problem: Problem, poses: np.ndarray, camera: np.ndarray, board: np.ndarray
+) -> dict[str, Any]:
+  """Returns root mean squares of errors: pixels, and the board's pose in the camera."""
+  expected = np.linalg.inv(camera) @ problem.motion @ board
+  shift = np.linalg.norm(expected[:, :3, 3] - poses[:, :3, 3], axis=1)
+  turn = [angle_deg(a, b) for a, b in zip(expected, poses, strict=True)]
+  return {
+    "px": rms(np.concatenate(problem.errors(camera, board))),
+    "mm": 1e3 * float(np.sqrt(np.mean(shift**2))),
+    "deg": float(np.sqrt(np.mean(np.square(turn)))),
+  }
+
+
+def _mean_pose(poses: np.ndarray) -> np.ndarray:
+  """Returns the median position and the mean rotation of poses."""
+  pose = np.eye(4)
+  pose[:3, :3] = Rotation.from_matrix(poses[:, :3, :3]).mean().as_matrix()
+  pose[:3, 3] = np.median(poses[:, :3, 3], axis=0)
+  return pose

@@ -1,0 +1,163 @@
+"""The devices of a robot by its name, opened where they are used.
+
+Drivers are imported in the functions, because each needs packages of its vendor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+import contextlib
+import dataclasses
+import importlib
+import signal
+from typing import Any
+
+from apnpql_jax.errors import ConfigError, DeviceError, one_line
+from apnpql_jax.robot.cell import Cell
+from apnpql_jax.robot.clock import Clock
+from apnpql_jax.robot.protocols import Arm, Camera, Gripper
+from apnpql_jax.robot.supervisor import CAMERAS
+
+ROBOTS = ("ur5e", "simulated", "double")
+
+_PACKAGES = {
+  "rtde_control": "ur_rtde",
+  "rtde_receive": "ur_rtde",
+  "dynamixel_sdk": "dynamixel-sdk",
+  "pyrealsense2": "pyrealsense2",
+  "pymodbus": "pymodbus",
+  "cv2": "opencv-contrib-python-headless",
+  "pyarrow": "pyarrow",
+}
+"""Modules that drivers import -> package that has them."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Robot:
+  """Which robot to open; crosses the borders of processes."""
+
+  kind: str
+  """One of ``ROBOTS``."""
+
+  contract: dict[str, Any]
+  """The contract of the policy."""
+
+  cell: Cell
+  """The cell, with addresses and limits."""
+
+  clock: Clock = Clock()
+  """The clock of the session."""
+
+  plant: str = ""
+  """Name of the shared memory of a simulated plant."""
+
+
+@contextlib.contextmanager
+def open_arm(robot: Robot) -> Generator[tuple[Arm, Gripper]]:
+  """Connects arm and gripper; nothing moves.
+
+  Raises:
+    DeviceError: A device is missing, silent or another one.
+    ConfigError: A package is missing.
+  """
+  with needing_packages(), contextlib.ExitStack() as stack:
+    if robot.kind == "simulated":
+      simulated = importlib.import_module("apnpql_jax.robot.simulated")
+      arm: Arm = simulated.SimulatedArm(robot.plant)
+      gripper: Gripper = simulated.SimulatedGripper(robot.plant)
+    else:
+      ur5e = importlib.import_module("apnpql_jax.robot.drivers.ur5e")
+      grippers = importlib.import_module("apnpql_jax.robot.drivers.gripper")
+      cell = robot.cell
+      arm = ur5e.UR5e(
+        cell.arm_host, payload_kg=cell.payload_kg, payload_cog_m=cell.payload_cog_m
+      )
+      gripper = grippers.RHP12RN(cell.gripper_port)
+    for device in (arm, gripper):
+      device.connect()
+      stack.callback(device.disconnect)
+    yield arm, gripper
+
+
+@contextlib.contextmanager
+def open_cameras(robot: Robot) -> Generator[Sequence[Camera]]:
+  """Connects the cameras, in the order of ``supervisor.CAMERAS``; see ``open_arm``."""
+  with needing_packages(), contextlib.ExitStack() as stack:
+    views = robot.contract["cameras"]
+    if robot.kind == "simulated":
+      rendered = importlib.import_module("apnpql_jax.robot.simulated_cameras")
+      cameras: Sequence[Camera] = rendered.make(robot.plant, robot.contract)
+    elif robot.kind == "double":
+      doubles = importlib.import_module("apnpql_jax.robot.doubles.cameras")
+      eyes = doubles.cameras(
+        robot.cell.arm_host, robot.contract["task"], robot.contract
+      )
+      by_name = stack.enter_context(eyes)
+      cameras = [by_name[name] for name in CAMERAS]
+    else:
+      realsense = importlib.import_module("apnpql_jax.robot.drivers.realsense")
+      serials, modes = robot.cell.cameras, calibrated_modes(robot)
+      cameras = [
+        realsense.RealSense(serials[x], view=views[x], **modes.get(x, {}))
+        for x in CAMERAS
+      ]
+    for camera in cameras:
+      camera.connect()
+      stack.callback(camera.disconnect)
+    yield cameras
+
+
+def calibrated_modes(robot: Robot) -> dict[str, Any]:
+  """Returns lens and image size of each camera whose lens the calibration estimated.
+
+  The other cameras have the maker's lens, in whichever mode.
+
+  Raises:
+    FileError: The calibration is damaged or of other cameras.
+    ConfigError: A camera is not where the policy was trained for.
+  """
+  cell = robot.cell
+  if cell.calibration is None or not cell.calibration.exists():
+    return {}
+  files: Any = importlib.import_module("apnpql_jax.robot.calibration.files")
+  found = files.load(cell.calibration, robot.contract, cell.cameras)
+  return {
+    name: {
+      "lens": camera.lens.to_json(),
+      "size": (camera.lens.height, camera.lens.width),
+    }
+    for name, camera in found.cameras.items()
+    if camera.about.get("lens_from") == "views"
+  }
+
+
+@contextlib.contextmanager
+def needing_packages() -> Generator[None]:
+  """Turns a missing package of a vendor into one line that names the cure."""
+  try:
+    yield
+  except ModuleNotFoundError as error:
+    name = (error.name or "").partition(".")[0]
+    if name not in _PACKAGES:
+      raise
+    raise ConfigError(
+      f"robot needs {_PACKAGES[name]}: pip install 'apnpql-jax[robot]'"
+    ) from error
+
+
+def leave_interrupts_to_the_main_process() -> None:
+  """Ignores Ctrl-C, which the terminal sends to all; the main process brakes first."""
+  signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def check_kind(kind: str) -> None:
+  """Raises ``ConfigError`` unless there is such a robot."""
+  if kind not in ROBOTS:
+    raise ConfigError(f"unknown --robot {kind!r}; choose from {', '.join(ROBOTS)}")
+
+
+def reason(error: BaseException) -> str:
+  """Returns an error of a device as one line."""
+  if isinstance(error, DeviceError):
+    return one_line(error)
+  return f"{type(error).__name__}: {one_line(error)}"

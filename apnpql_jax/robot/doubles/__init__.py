@@ -1,0 +1,137 @@
+"""Doubles of the devices, to which the vendors' own clients connect.
+
+They speak the devices' protocols, with one MuJoCo scene behind all of them, so that a
+whole run can be rehearsed without hardware, and each fault can be caused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+import contextlib
+import itertools
+import os
+from typing import Any
+
+from apnpql_jax.robot.doubles.cameras import cameras
+from apnpql_jax.robot.doubles.child import Child
+from apnpql_jax.robot.doubles.server import ask
+from apnpql_jax.robot.drivers.gripper import RHP12RN, connect
+from apnpql_jax.robot.drivers.realsense import RealSense
+from apnpql_jax.robot.drivers.rh_p12_rn import RNA
+from apnpql_jax.robot.drivers.ur5e import UR5e
+
+PAYLOAD_KG = 0.488
+"""Gripper and camera in the scenes."""
+
+PAYLOAD_COG_M = (-0.006, 0.0, 0.048)
+_COUNT = itertools.count()
+
+
+class Doubles:
+  """The devices, connected through their drivers, and their faults."""
+
+  def __init__(
+    self, host: str, arm: UR5e, gripper: RHP12RN, cameras: dict[str, RealSense]
+  ):
+    """Keeps the devices and the address of the processes behind them."""
+    self.host = host
+    self.arm, self.gripper, self.cameras = arm, gripper, cameras
+
+  def drop_rtde(self) -> None:
+    """Cuts the connection to the arm for good."""
+    ask(self.host, "drop_rtde")
+
+  def protective_stop(self) -> None:
+    """Stops the arm as after a collision."""
+    ask(self.host, "protective_stop")
+
+  def emergency_stop(self) -> None:
+    """Stops the arm as if the button was pushed."""
+    ask(self.host, "emergency_stop")
+
+  def stop_program(self) -> None:
+    """Ends the program on the controller, as the teach pendant can."""
+    ask(self.host, "stop_program")
+
+  def silence_gripper(self) -> None:
+    """Makes the gripper ignore its bus, as without power."""
+    ask(self.host, "silence_gripper")
+
+  def fail_gripper(self) -> None:
+    """Makes the gripper report an overload."""
+    ask(self.host, "fail_gripper")
+
+  def unplug_cameras(self) -> None:
+    """Ends the frames of both cameras."""
+    ask(self.host, "unplug_cameras")
+
+  def state(self) -> dict[str, Any]:
+    """Returns the plant's true state: position, target, finger, qpos, mocap poses."""
+    return ask(self.host, "state")
+
+
+@contextlib.contextmanager
+def start(
+  task: str, contract: dict[str, Any] | None = None, **settings: Any
+) -> Generator[Doubles]:
+  """Starts the doubles and connects the drivers to them, all in this process.
+
+  Args:
+    task: Name of the task, or path of its MJCF file.
+    contract: That of the policy, see ``deploy.contract``; no cameras without.
+    settings: See ``serve``.
+
+  Raises:
+    UserError: A package is missing, or a double cannot start.
+  """
+  with contextlib.ExitStack() as stack:
+    server = serve(task, **settings)
+    stack.callback(server.close)
+    host, terminal = server.greeting
+    arm = UR5e(host, payload_kg=PAYLOAD_KG, payload_cog_m=PAYLOAD_COG_M)
+    arm.connect()
+    stack.callback(arm.disconnect)
+    gripper = connect(terminal)
+    stack.callback(gripper.disconnect)
+    eyes = stack.enter_context(cameras(host, task, contract)) if contract else {}
+    for camera in eyes.values():
+      camera.connect()
+      stack.callback(camera.disconnect)
+    yield Doubles(host, arm, gripper, eyes)
+
+
+def serve(
+  task: str,
+  *,
+  noise: bool = True,
+  gripper: int = RNA.model_number,
+  model_number: int | None = None,
+  modbus: bool = False,
+  **controller: Any,
+) -> Child:
+  """Starts the doubles of arm and gripper; greets with address and serial port.
+
+  Args:
+    task: Name of the task, or path of its MJCF file.
+    noise: Whether the force-torque sensor is noisy.
+    gripper: Model number of the gripper.
+    model_number: What it gives as its model number, if not that.
+    modbus: Whether the gripper speaks Modbus-RTU.
+    controller: Arguments of ``controller.Controller``.
+  """
+  settings = {
+    "scene": task,
+    "host": _address(),
+    "noise": noise,
+    "gripper": gripper,
+    "model_number": model_number,
+    "modbus": modbus,
+    "controller": controller,
+  }
+  return Child("apnpql_jax.robot.doubles.server", settings)
+
+
+def _address() -> str:
+  """Returns a loopback address of this process's own, as the ports are fixed."""
+  process, count = os.getpid(), next(_COUNT)
+  return f"127.{process // 250 % 250 + 1}.{process % 250 + 1}.{count % 250 + 1}"

@@ -1,0 +1,143 @@
+"""The buses on which a gripper can be: Dynamixel protocol 2.0 and Modbus-RTU.
+
+An RH-P12-RN(A) speaks either, as its Protocol Type(13) says. The manufacturer does not
+publish the registers of Modbus. Those who use it (the project
+``Doosan-E0509-ROBOTIS-RH-P12-RN-TCP-Bridge`` on GitHub) find the bytes of addresses 2n
+and 2n + 1 of the control table in register n, low byte first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import contextlib
+import importlib
+import time
+from typing import Any, Protocol
+
+from apnpql_jax.errors import DeviceError, one_line
+from apnpql_jax.robot.drivers import vendor
+
+_PATIENCE = 0.5  # s without an answer before the gripper counts as lost
+_ATTEMPT = 0.05  # s for one answer by Modbus; the SDK has a similar limit
+_SILENT = "it does not answer: check its power and cable"
+
+
+class Silent(DeviceError):
+  """Nothing answers on the bus."""
+
+
+class Bus(Protocol):
+  """Access to the bytes of a control table."""
+
+  name: str
+
+  def read(self, address: int, size: int) -> bytes:
+    """Returns bytes of the control table; raises ``DeviceError``."""
+    ...
+
+  def write(self, address: int, data: bytes) -> None:
+    """Writes bytes of the control table; raises ``DeviceError``."""
+    ...
+
+  def close(self) -> None:
+    """Closes the port."""
+    ...
+
+
+class Dynamixel:
+  """Protocol 2.0, by ``dynamixel-sdk``."""
+
+  name = "Dynamixel 2.0"
+
+  def __init__(self, port: str, baud: int, device_id: int):
+    """Opens the port.
+
+    Raises:
+      DeviceError: The port cannot be opened, or the package is missing.
+    """
+    sdk = vendor("dynamixel_sdk", "dynamixel-sdk")
+    self._success, self._where, self._id = sdk.COMM_SUCCESS, port, device_id
+    self._port, self._packets = sdk.PortHandler(port), sdk.PacketHandler(2.0)
+    try:
+      self._port.setBaudRate(baud)  # Opens the port.
+    except Exception as error:  # Those of pyserial, and of termios.
+      raise DeviceError(one_line(error)) from None
+
+  def read(self, address: int, size: int) -> bytes:
+    """See ``Bus``."""
+    data, *_ = self._try(self._packets.readTxRx, address, size)
+    return bytes(data)
+
+  def write(self, address: int, data: bytes) -> None:
+    """See ``Bus``."""
+    *_, error = self._try(self._packets.writeTxRx, address, len(data), list(data))
+    if error & 0x7F:  # Bit 7 tells of a hardware error, which has its own reading.
+      reason = one_line(Exception(self._packets.getRxPacketError(error & 0x7F)))
+      raise DeviceError(f"{self._where}: it refuses to write {address}: {reason}")
+
+  def close(self) -> None:
+    """See ``Bus``."""
+    self._port.closePort()
+
+  def _try(self, call: Callable[..., tuple], *args: Any) -> tuple:
+    """Returns what a call of the SDK returns, (..., result, error); tries again."""
+    end = time.monotonic() + _PATIENCE
+    while time.monotonic() < end:
+      answer = call(self._port, self._id, *args)
+      if answer[-2] == self._success:
+        return answer
+      self._port.clearPort()
+    raise Silent(f"{self._where}: {_SILENT}")
+
+
+class Modbus:
+  """Modbus-RTU, by ``pymodbus``."""
+
+  name = "Modbus-RTU"
+
+  def __init__(self, port: str, baud: int, device_id: int):
+    """Opens the port.
+
+    Raises:
+      DeviceError: The port cannot be opened, or the package is missing.
+    """
+    client = vendor("pymodbus.client", "pymodbus").ModbusSerialClient
+    self._failure = importlib.import_module("pymodbus.exceptions").ModbusException
+    self._where, self._id = port, device_id
+    self._client = client(port, baudrate=baud, timeout=_ATTEMPT, retries=0)
+    if not self._client.connect():
+      raise DeviceError(f"could not open port {port}")
+
+  def read(self, address: int, size: int) -> bytes:
+    """See ``Bus``."""
+    first, end = address // 2, (address + size + 1) // 2
+    answer = self._try(self._client.read_holding_registers, first, count=end - first)
+    data = b"".join(x.to_bytes(2, "little") for x in answer.registers)
+    start = address - 2 * first
+    return data[start : start + size]
+
+  def write(self, address: int, data: bytes) -> None:
+    """See ``Bus``; the rest of the first and the last register stays."""
+    first, end = address // 2, (address + len(data) + 1) // 2
+    if address % 2 or len(data) % 2:
+      whole = bytearray(self.read(2 * first, 2 * (end - first)))
+      whole[address - 2 * first : address - 2 * first + len(data)] = data
+      data = bytes(whole)
+    words = [int.from_bytes(data[i : i + 2], "little") for i in range(0, len(data), 2)]
+    self._try(self._client.write_registers, first, words)
+
+  def close(self) -> None:
+    """See ``Bus``."""
+    self._client.close()
+
+  def _try(self, call: Callable[..., Any], first: int, *args: Any, **named: Any) -> Any:
+    end = time.monotonic() + _PATIENCE
+    while time.monotonic() < end:
+      with contextlib.suppress(self._failure):
+        answer = call(first, *args, device_id=self._id, **named)
+        if answer.isError():
+          raise DeviceError(
+            f"{self._where}: it refuses register {first}: {one_line(Exception(answer))}"
+          )
+        return answer
+    raise Silent(f"{self._where}: {_SILENT}")

@@ -1,0 +1,57 @@
+"""A UR controller that is only read, while the teach pendant has control."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Any
+
+from apnpql_jax.errors import DeviceError, one_line
+from apnpql_jax.robot.drivers import vendor
+from apnpql_jax.robot.drivers.ur_check import check_rtde
+from apnpql_jax.robot.drivers.ur_state import CYCLE, VARIABLES, Reports
+from apnpql_jax.robot.protocols import ArmState
+
+
+class Listener:
+  """An arm that is measured, such as in free drive; it takes no commands."""
+
+  def __init__(self, host: str):
+    """Stores the address; ``connect`` opens the connection."""
+    self._host = host
+    self._receive: Any = None
+    self._reports: Reports | None = None
+
+  def connect(self) -> None:
+    """See ``protocols.Device``; in local and in remote control.
+
+    Raises:
+      DeviceError: Nothing answers.
+    """
+    receive = vendor("rtde_receive", "ur_rtde")
+    check_rtde(self._host)
+    try:
+      self._receive = receive.RTDEReceiveInterface(self._host, 1 / CYCLE, VARIABLES)
+    except Exception as error:  # ur_rtde raises several kinds.
+      raise DeviceError(f"{self._host}: {one_line(error)}") from None
+    self._reports = Reports(self._host, self._receive)
+
+  def disconnect(self) -> None:
+    """See ``protocols.Device``."""
+    receive, self._receive, self._reports = self._receive, None, None
+    with contextlib.suppress(Exception):  # Whatever a lost connection raises.
+      if receive:
+        receive.disconnect()
+
+  def describe(self) -> dict[str, Any]:
+    """See ``protocols.Device``."""
+    return {"host": self._host}
+
+  def get_observation(self) -> ArmState:
+    """See ``protocols.Arm``.
+
+    Raises:
+      DeviceError: The connection is lost.
+    """
+    if self._reports is None or not self._reports.connected:
+      raise DeviceError(f"{self._host}: lost the connection: check network and power")
+    return self._reports.measure(following=False)

@@ -1,0 +1,153 @@
+"""A simulated robot at its table, in C MuJoCo: the whole scene of a task.
+
+The arm is position-controlled as with the controller's ``servoJ``: it follows a target
+with a lag, by stiff feedback with gravity compensation, against the friction of its
+joints. The wrist sensor reports the contacts of hand and fingers, with noise and bias.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+import dataclasses
+
+import mujoco
+import numpy as np
+
+from apnpql_jax.robot.arm_model import BASE, FLANGE, JOINTS
+from apnpql_jax.robot.limits import TIMESTEP
+from apnpql_jax.robot.protocols import ArmState
+from apnpql_jax.sim import motors
+
+
+@dataclasses.dataclass(frozen=True)
+class Servo:
+  """How the simulated arm follows commands; guesses, not those of a real UR5e."""
+
+  lookahead_s: float = 0.03
+  """Time constant with which the target is approached, s."""
+
+  gain: float = 100.0
+  """Natural frequency of the position feedback, 1/s; critically damped."""
+
+  friction_nm: tuple[float, ...] = (5.0, 5.0, 5.0, 1.5, 1.5, 1.5)
+  """Coulomb friction of the joints, N m."""
+
+  latency_s: float = 0.0
+  """Time until a command arrives, s."""
+
+  force_noise_n: float = 0.5
+  """Standard deviation of the force, N; a tenth of it in N m for the torque."""
+
+  force_bias_n: float = 1.5
+  """Standard deviation of the bias that remains after zeroing, N."""
+
+
+class Plant:
+  """The robot and its scene, advanced by 2 ms at a time."""
+
+  def __init__(
+    self, model: mujoco.MjModel, servo: Servo | None = None, *, seed: int = 0
+  ) -> None:
+    """Starts at the keyframe "neutral"; changes the timestep and friction of model."""
+    self.servo = Servo() if servo is None else servo
+    self.model, self.data = model, mujoco.MjData(model)
+    model.opt.timestep = TIMESTEP
+    joints = [model.joint(name) for name in JOINTS]
+    self._qpos = np.array([int(x.qposadr[0]) for x in joints])
+    self._dof = np.array([int(x.dofadr[0]) for x in joints])
+    model.dof_frictionloss[self._dof] = self.servo.friction_nm
+    finger = model.joint("finger_r1")
+    self._finger, self._finger_dof = int(finger.qposadr[0]), int(finger.dofadr[0])
+    self._limit = model.actuator_ctrlrange[: len(JOINTS), 1].copy()
+    self._hand = _subtree(model, model.body("gripper").id)
+    self._rng = np.random.default_rng(seed)
+    self._bias = np.zeros(6)
+    self.data.qpos[:] = model.keyframe("neutral").qpos
+    self._settle()
+
+  def zero_force(self) -> None:
+    """Draws the bias that the sensor keeps after it has been zeroed."""
+    scale = self.servo.force_bias_n * np.repeat([1.0, 0.1], 3)
+    self._bias = scale * self._rng.normal(size=6)
+
+  def place(
+    self, qpos: np.ndarray, mocap_pos: np.ndarray, mocap_quat: np.ndarray
+  ) -> None:
+    """Puts the objects where a reset state has them; the robot stays as it is."""
+    robot = slice(0, self._finger + 4)
+    placed = np.array(qpos, float)
+    placed[robot] = self.data.qpos[robot]
+    self.data.qpos[:], self.data.qvel[:] = placed, 0.0
+    self.data.mocap_pos[:], self.data.mocap_quat[:] = mocap_pos, mocap_quat
+    mujoco.mj_forward(self.model, self.data)
+
+  def put_arm(self, position: np.ndarray) -> None:
+    """Puts the arm at joint angles f64[6], at rest."""
+    self.data.qpos[self._qpos], self.data.qvel[self._dof] = position, 0.0
+    self._settle()
+
+  def step(self, target: np.ndarray | None, close: bool) -> None:
+    """Advances by 2 ms; the arm keeps its place without a ``target`` f64[6]."""
+    model, data, servo = self.model, self.data, self.servo
+    self._queue.append(self._queue[-1] if target is None else np.array(target))
+    arriving = self._queue[0]
+    before = self._reference
+    share = 1 - np.exp(-TIMESTEP / servo.lookahead_s)
+    self._reference = before + share * (arriving - before)
+    speed = (self._reference - before) / TIMESTEP
+    mass = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, mass)
+    velocity = data.qvel[self._dof]
+    wanted = servo.gain**2 * (self._reference - data.qpos[self._qpos])
+    wanted += 2 * servo.gain * (speed - velocity)
+    torque = mass[np.ix_(self._dof, self._dof)] @ wanted + data.qfrc_bias[self._dof]
+    data.ctrl[: len(JOINTS)] = torque.clip(-self._limit, self._limit)
+    data.ctrl[len(JOINTS)] = motors.gripper_torque(
+      data.qpos[self._finger], data.qvel[self._finger_dof], float(close), np
+    )
+    mujoco.mj_step1(model, data)
+    mujoco.mj_step2(model, data)
+
+  def arm_state(self, now: float) -> ArmState:
+    """Returns what the arm measures."""
+    data = self.data
+    scale = self.servo.force_noise_n * np.repeat([1.0, 0.1], 3)
+    noise = scale * self._rng.normal(size=6)
+    return ArmState(
+      now,
+      data.qpos[self._qpos].copy(),
+      data.qvel[self._dof].copy(),
+      self.wrench() + self._bias + noise,
+    )
+
+  def wrench(self) -> np.ndarray:
+    """Returns force and torque of the contacts on the hand, see ``ArmState.wrench``."""
+    model, data = self.model, self.data
+    mujoco.mj_rnePostConstraint(model, data)
+    torque, force = np.split(data.cfrc_ext[self._hand].sum(0), 2)
+    flange, base = data.site(FLANGE), data.site(BASE)
+    center = data.subtree_com[model.body_rootid[self._hand[0]]]
+    torque = torque + np.cross(center - flange.xpos, force)
+    turn = base.xmat.reshape(3, 3).T
+    return np.concatenate([turn @ force, turn @ torque])
+
+  @property
+  def gripper_angle(self) -> float:
+    """Angle of the driven finger, rad."""
+    return float(self.data.qpos[self._finger])
+
+  def _settle(self) -> None:
+    """Forgets commands and lets the arm hold where it is."""
+    self._reference = self.data.qpos[self._qpos].copy()
+    count = 1 + round(self.servo.latency_s / TIMESTEP)
+    self._queue = deque([self._reference.copy()] * count, maxlen=count)
+    mujoco.mj_forward(self.model, self.data)
+
+
+def _subtree(model: mujoco.MjModel, top: int) -> np.ndarray:
+  """Returns the ids of a body and of all below it."""
+  found = [top]
+  for body in range(top + 1, model.nbody):
+    if model.body_parentid[body] in found:
+      found.append(body)
+  return np.array(found)

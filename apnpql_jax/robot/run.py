@@ -1,0 +1,128 @@
+"""Episodes of a policy on a robot."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+import contextlib
+import dataclasses
+import json
+from pathlib import Path
+import signal
+from typing import Any
+
+from apnpql_jax.console import print_line
+from apnpql_jax.errors import DeviceError, FileError
+from apnpql_jax.robot import recorder
+from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.policy_folder import PolicyFolder
+from apnpql_jax.robot.session import Options, Outcome, Session
+from apnpql_jax.robot.supervisor import NO_ACTION
+from apnpql_jax.runs.metrics import wilson_interval
+
+EVENTS = "episodes.jsonl"
+"""File in the folder of a log: an episode per line, with each hold and stop."""
+
+
+def run(
+  robot: Robot, policy: PolicyFolder, options: Options, *, episodes: int
+) -> dict[str, Any]:
+  """Plays episodes, each from the neutral pose, and prints a line about each.
+
+  A fault ends its episode, and the next one begins, unless the arm cannot go home.
+
+  Returns:
+    Counts, reasons, and the success rate if a simulated robot can judge it.
+
+  Raises:
+    ConfigError: A package is missing.
+    FileError: The log exists, or the one to replay is none.
+    DeviceError: A device or process has failed.
+    RunStopped: SIGINT or SIGTERM came; the arm is at rest.
+  """
+  if options.log is not None:
+    recorder.check_available()
+    if Path(options.log).exists():
+      raise FileError(f"{options.log!r} exists; name another folder with --log")
+  if options.replay is not None:
+    recorder.recorded_actions(Path(options.replay))
+  outcomes: list[Outcome] = []
+  failure = ""
+  with contextlib.ExitStack() as stack:
+    caught = stack.enter_context(catching_signals())
+    session = stack.enter_context(Session(robot, policy, options, caught))
+    session.wait_until_ready()
+    try:
+      for episode in range(episodes):
+        session.go_home()
+        outcomes.append(session.play())
+        _report(episode, episodes, outcomes[-1])
+        _keep(options.log, outcomes[-1])
+    except DeviceError as error:
+      if not outcomes:
+        raise
+      failure = str(error)
+      print_line(f"the session ends after {len(outcomes)} episodes: {failure}")
+  return _summary(robot, options, outcomes, failure)
+
+
+@contextlib.contextmanager
+def catching_signals() -> Generator[list[int]]:
+  """Yields a list that gets SIGINT and SIGTERM, which otherwise would end all at once.
+
+  A session ends at the first one, with the arm at rest.
+  """
+  caught: list[int] = []
+  wake = signal.set_wakeup_fd(-1)  # Of ``runs.signals``, which would end at once.
+  before = {
+    number: signal.signal(number, lambda number, _: caught.append(number))
+    for number in (signal.SIGINT, signal.SIGTERM)
+  }
+  try:
+    yield caught
+  finally:
+    for number, handler in before.items():
+      signal.signal(number, handler)
+    signal.set_wakeup_fd(wake)
+
+
+def _report(episode: int, episodes: int, outcome: Outcome) -> None:
+  holds = sum(
+    mode == "hold" and reason != NO_ACTION for _, mode, reason in outcome.events
+  )
+  print_line(
+    f"episode {episode + 1} of {episodes}: {outcome.reason}, {outcome.seconds:.1f} s, "
+    f"{outcome.actions} actions, {holds} holds"
+  )
+
+
+def _keep(log: str | None, outcome: Outcome) -> None:
+  if log is None:
+    return
+  with (Path(log) / EVENTS).open("a", encoding="utf-8") as file:
+    file.write(json.dumps(dataclasses.asdict(outcome)) + "\n")
+
+
+def _summary(
+  robot: Robot, options: Options, outcomes: list[Outcome], failure: str
+) -> dict[str, Any]:
+  found: dict[str, Any] = {
+    "robot": robot.kind,
+    "task": robot.contract["task"],
+    "episodes": len(outcomes),
+    "reasons": [x.reason for x in outcomes],
+    "actions": sum(x.actions for x in outcomes),
+    "seconds": sum(x.seconds for x in outcomes),
+  }
+  judged = [x.solved for x in outcomes if x.solved is not None]
+  if judged:
+    solved = sum(judged)
+    found |= {
+      "successes": solved,
+      "success_rate": solved / len(judged),
+      "ci95": wilson_interval(solved, len(judged)),
+    }
+  if options.log is not None:
+    found["log"] = options.log
+  if failure:
+    found |= {"failure": failure, "exit_code": 3}
+  return found

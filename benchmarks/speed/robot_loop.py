@@ -1,0 +1,87 @@
+"""Delays of the actions, and periods of the 500 Hz loop, on the simulated robot.
+
+  python -m benchmarks.speed.robot_loop
+  python -m benchmarks.speed.robot_loop --policy policy --actions 200
+
+The delay of an action is the time from the beginning of its control period, with
+both frames drawn on the CPU, until the control process can read it. Only figures of an
+idle machine mean anything: plant, cameras and policy share it with the loop.
+"""
+
+from pathlib import Path
+import tempfile
+from typing import Any
+
+import numpy as np
+
+from apnpql_jax.config import files
+from apnpql_jax.robot import policy_folder
+from apnpql_jax.robot.board import PERIOD_BIN_S
+from apnpql_jax.robot.cell import Cell
+from apnpql_jax.robot.clock import Clock
+from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.session import Options, Session
+from apnpql_jax.testing import SMALL, export_untrained
+from benchmarks.common import command
+
+
+def main() -> None:
+  parser = command.parser(__doc__)
+  parser.add_argument("--policy", type=Path, help="folder; an untrained one if absent")
+  parser.add_argument("--actions", type=int, default=1000)
+  parser.add_argument("--slowdown", type=float, default=1.0, help="only to try it")
+  args = command.parse(parser)
+  actions = 20 if args.quick else args.actions
+  with tempfile.TemporaryDirectory() as folder:
+    path = args.policy or Path(folder) / "policy"
+    if args.policy is None:
+      agent = SMALL if args.quick else files.load_preset("push_plate").agent
+      export_untrained(path, agent)
+    result = measure(path, actions, args.slowdown)
+  command.publish("robot_loop", args, [result], policy=str(args.policy or "untrained"))
+
+
+def measure(path: Path, actions: int, slowdown: float) -> dict[str, Any]:
+  """Returns quantiles of the delays (ms) and of the periods (ms)."""
+  policy = policy_folder.load(path)
+  robot = Robot("simulated", policy.contract, Cell(), Clock(slowdown))
+  delays: dict[tuple[int, int], float] = {}
+  periods, stops = 0, []
+  with Session(robot, policy, Options()) as session:
+    session.wait_until_ready()
+    while len(delays) < actions:
+      session.go_home()
+      before = session.board["state"].read()["periods"]
+      outcome = session.play(watch=lambda found: _note(delays, found))
+      periods = periods + session.board["state"].read()["periods"] - before
+      stops.append(outcome.reason)
+  found = 1e3 * np.array(list(delays.values()))
+  return {
+    "actions": len(found),
+    "delay_p50_ms": float(np.quantile(found, 0.5)),
+    "delay_p99_ms": float(np.quantile(found, 0.99)),
+    "delay_max_ms": float(found.max()),
+    "beyond_a_period": int((found > 1e3 * policy.contract["control_period_s"]).sum()),
+    "cycles": int(np.sum(periods)),
+    "period_p50_ms": _quantile(periods, 0.5),
+    "period_p99_ms": _quantile(periods, 0.99),
+    "period_max_ms": _quantile(periods, 1.0),
+    "episodes": {reason: stops.count(reason) for reason in stops},
+  }
+
+
+def _note(delays: dict[tuple[int, int], float], found: Any) -> None:
+  """Keeps the delay of a new action, from a record "policy"."""
+  if found["actions"] and not found["over"]:
+    delays[int(found["order"]), int(found["actions"])] = float(found["delay"])
+
+
+def _quantile(histogram: Any, share: float) -> float:
+  """Returns the upper end of the bin with a quantile, ms."""
+  counts = np.cumsum(histogram)
+  index = int(np.searchsorted(counts, share * counts[-1]))
+  return 1e3 * PERIOD_BIN_S * (index + 1)
+
+
+if __name__ == "__main__":
+  main()

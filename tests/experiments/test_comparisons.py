@@ -1,0 +1,61 @@
+"""The runs of the comparisons: their settings work, budgets are equal."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+
+from comparison import PAPER, TASKS, Comparison
+import pixel_comparison
+import pytest
+import state_comparison
+
+from apnpql_jax.agents.table_one import epsilon_bounds
+from apnpql_jax.config.checks import validate
+from apnpql_jax.config.files import config_diff
+
+COMPARISONS = [state_comparison.COMPARISON, pixel_comparison.COMPARISON]
+RUNS = [
+  (comparison, task, row)
+  for comparison in COMPARISONS
+  for task, row in itertools.product(TASKS, comparison.rows)
+]
+
+by_folder = pytest.mark.parametrize("comparison", COMPARISONS, ids=lambda x: x.out.name)
+
+
+@pytest.mark.parametrize(("comparison", "task", "row"), RUNS)
+def test_settings_of_a_run_are_accepted(comparison: Comparison, task: str, row: str):
+  config = comparison.config_of(task, row, 0)
+  validate(config, tasks=[task], algorithms=epsilon_bounds())
+  assert config.total_steps % config.eval_every == 0
+
+
+@by_folder
+@pytest.mark.parametrize("task", TASKS)
+def test_rows_of_the_paper_differ_in_the_algorithm_and_its_own_settings(
+  comparison: Comparison, task: str
+):
+  """Budget, replay, world and what all share of the agent are the same."""
+  first, *others = (comparison.config_of(task, row, 0) for row in PAPER)
+  own = {"algorithm", "epsilon", "policy_initial_std", "min_alpha"}
+  for other in others:
+    assert config_diff(first, other).keys() <= {f"agent.{name}" for name in own}
+
+
+@by_folder
+def test_the_stored_results_are_read_and_give_the_stored_table(comparison: Comparison):
+  found = comparison.results()
+  assert found
+  assert comparison.table(found) == (comparison.out / "table.md").read_text()
+
+
+@by_folder
+def test_a_result_of_other_settings_is_refused(comparison: Comparison, tmp_path):
+  stored = next(comparison.out.glob("*-ap_npql-*.json"))
+  result = json.loads(stored.read_text())
+  result["config"]["agent"]["gamma"] = 0.9
+  (tmp_path / stored.name).write_text(json.dumps(result))
+  with pytest.raises(SystemExit, match="gamma"):
+    dataclasses.replace(comparison, out=tmp_path).results()

@@ -1,0 +1,219 @@
+"""The driver of the gripper, by the vendor's SDK, against a double on a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+import contextlib
+import math
+import os
+import sys
+import threading
+import time
+import tty
+
+import mujoco
+import numpy as np
+import pytest
+
+from apnpql_jax.config import files
+from apnpql_jax.errors import DeviceError
+from apnpql_jax.robot import doubles
+from apnpql_jax.robot.doubles.dynamixel import crc
+from apnpql_jax.robot.doubles.modbus import crc as modbus_crc
+from apnpql_jax.robot.doubles.server import ask
+from apnpql_jax.robot.drivers import gripper as driver
+from apnpql_jax.robot.drivers.rh_p12_rn import CLOSED, OPEN, TICK, finger_speed, pad_gap
+
+sdk = pytest.importorskip("dynamixel_sdk", reason="needs dynamixel-sdk")
+
+MODELS = {35073: "RH-P12-RN", 35074: "RH-P12-RN(A)"}
+ADDRESSES = {35073: (562, 596, 611), 35074: (512, 564, 580)}
+"""Torque enable, goal position and present position in the e-Manual."""
+
+
+@contextlib.contextmanager
+def bench(**settings) -> Generator[tuple[str, str]]:
+  """Address of the doubles, and the gripper's serial port."""
+  server = doubles.serve("push_plate", **settings)
+  yield server.greeting
+  server.close()
+
+
+@contextlib.contextmanager
+def held(port: str) -> Generator[driver.RHP12RN]:
+  """The connected gripper."""
+  gripper = driver.connect(port)
+  yield gripper
+  gripper.disconnect()
+
+
+def settle(gripper: driver.RHP12RN, angle: float, seconds: float = 6.0) -> list:
+  """Waits until the finger is at an angle; returns (time, angle) on the way."""
+  end, log = time.monotonic() + seconds, []
+  while not log or abs(log[-1][1] - angle) > 0.01:
+    assert time.monotonic() < end, f"at {log[-1][1]} rad"
+    state = gripper.get_observation()
+    log.append((state.time, state.angle))
+    time.sleep(0.01)
+  return log
+
+
+@pytest.mark.parametrize(
+  ("number", "bus"),
+  [(35073, "Dynamixel 2.0"), (35074, "Dynamixel 2.0"), (35074, "Modbus-RTU")],
+)
+def test_the_model_is_identified_and_opens_and_closes(number, bus):
+  if modbus := bus == "Modbus-RTU":
+    pytest.importorskip("pymodbus", reason="needs pymodbus")
+  with bench(gripper=number, modbus=modbus) as (host, port), held(port) as gripper:
+    about = gripper.describe()
+    found = about["model"], about["model_number"], about["bus"]
+    assert found == (MODELS[number], number, bus)
+    for close, angle in ((False, 0.0), (True, 1.1), (False, 0.0)):
+      gripper.send_action(close)
+      gripper.send_action(close)  # Changes nothing.
+      settle(gripper, angle)
+      time.sleep(0.5)  # Now it stands still.
+      truth = ask(host, "state")["finger"]
+      assert gripper.get_observation().angle == pytest.approx(truth, abs=2 * TICK)
+
+
+def test_the_gap_closes_at_the_speed_of_the_training():
+  with bench() as (_, port), held(port) as gripper:
+    gripper.send_action(False)
+    settle(gripper, 0.0)
+    gripper.send_action(True)
+    times, angles = np.transpose(settle(gripper, 1.1))
+  gaps = np.array([pad_gap(angle) for angle in angles])
+  inner = (gaps < 0.09) & (gaps > 0.015)  # After the ramp of the profile.
+  speed = -np.polyfit(times[inner], gaps[inner], 1)[0]
+  assert speed == pytest.approx(0.075, rel=0.15)
+
+
+@pytest.mark.parametrize("number", MODELS)
+def test_the_double_has_the_table_of_the_manual(number):
+  torque, goal, present = ADDRESSES[number]
+  with bench(gripper=number) as (_, port):
+    serial, packets = sdk.PortHandler(port), sdk.PacketHandler(2.0)
+    serial.setBaudRate(57600)
+
+    def retry(call, *args):
+      for _ in range(20):
+        *values, result, error = call(serial, 1, *args)
+        if result == sdk.COMM_SUCCESS:
+          return *values, error
+      raise AssertionError("the double does not answer")
+
+    assert retry(packets.ping)[0] == number
+    closed = retry(packets.read4ByteTxRx, present)[0]
+    assert closed == pytest.approx(1.1 / TICK, abs=2)
+    retry(packets.write4ByteTxRx, goal, 300)
+    time.sleep(0.3)
+    assert retry(packets.read4ByteTxRx, present)[0] == pytest.approx(closed, abs=15)
+    # Goal current and velocity.
+    retry(packets.write2ByteTxRx, 604 if number == 35073 else 550, 200)
+    retry(packets.write1ByteTxRx, torque, 1)
+    time.sleep(1.0)
+    assert retry(packets.read4ByteTxRx, present)[0] == pytest.approx(300, abs=3)
+    assert retry(packets.write4ByteTxRx, goal, 1151)[0] == sdk.ERRNUM_DATA_LIMIT
+    assert retry(packets.write1ByteTxRx, 11, 0)[0] == sdk.ERRNUM_ACCESS
+    serial.closePort()
+
+
+def test_ticks_span_the_range_of_the_joint():
+  model = mujoco.MjModel.from_xml_path(str(files.mjcf_path("robot")))
+  assert OPEN * TICK == model.joint("finger_r1").range[0]
+  # At 740 ticks the pads would touch: the fingers squeeze in the closed position.
+  assert model.joint("finger_r1").range[1] < CLOSED * TICK < 1.15
+  assert pad_gap(CLOSED * TICK) < 0 < pad_gap(1.1) < 0.003
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, 0.7, 1.1])
+def test_gap_and_speed_are_those_of_the_linkage(angle):
+  model = mujoco.MjModel.from_xml_path(str(files.mjcf_path("robot")))
+  data = mujoco.MjData(model)
+
+  def gap(q: float) -> float:
+    for name in ("finger_r1", "finger_r2", "finger_l1", "finger_l2"):
+      data.qpos[model.joint(name).qposadr[0]] = q
+    mujoco.mj_kinematics(model, data)
+    pads = [data.geom(name) for name in ("r_pad", "l_pad")]
+    distance = np.linalg.norm(pads[0].xpos - pads[1].xpos)
+    return float(distance) - 2 * model.geom("r_pad").size[1]
+
+  assert pad_gap(angle) == pytest.approx(gap(angle), abs=2e-4)
+  slope = (gap(angle + 1e-4) - gap(angle - 1e-4)) / 2e-4
+  assert -slope * finger_speed(angle) == pytest.approx(0.075, rel=0.01)
+
+
+@pytest.mark.parametrize("modbus", [False, True])
+def test_a_silent_gripper_is_one_line_in_time(modbus):
+  if modbus:
+    pytest.importorskip("pymodbus", reason="needs pymodbus")
+  with bench(modbus=modbus) as (host, port), held(port) as gripper:
+    ask(host, "silence_gripper")
+    begin = time.monotonic()
+    with pytest.raises(DeviceError, match="does not answer: check its power") as error:
+      while time.monotonic() < begin + 3:
+        gripper.get_observation()
+        time.sleep(0.01)
+    assert time.monotonic() < begin + 1.5
+    assert "\n" not in str(error.value)
+    with pytest.raises(DeviceError, match="does not answer"):
+      gripper.send_action(True)
+
+
+def test_a_hardware_error_is_one_line():
+  with bench() as (host, port), held(port) as gripper:
+    ask(host, "fail_gripper")
+    end = time.monotonic() + 3
+    with pytest.raises(DeviceError, match="it is overloaded; turn it off and on"):
+      while time.monotonic() < end:
+        gripper.get_observation()
+        time.sleep(0.01)
+
+
+def test_another_dynamixel_is_one_line():
+  with (
+    bench(model_number=1020) as (_, port),
+    pytest.raises(DeviceError, match=r"number 1020, not RH-P12-RN \(35073\) or"),
+  ):
+    driver.connect(port)
+
+
+@pytest.mark.parametrize("echo", [False, True])
+def test_a_port_without_a_gripper_is_one_line(echo):
+  ours, theirs = os.openpty()
+  tty.setraw(theirs)
+
+  def answer() -> None:
+    with contextlib.suppress(OSError):
+      while data := os.read(ours, 100):
+        if echo:
+          os.write(ours, data)
+
+  threading.Thread(target=answer, daemon=True).start()
+  begin = time.monotonic()
+  with pytest.raises(DeviceError, match="nothing answers at /dev/pts") as error:
+    driver.connect(os.ttyname(theirs))
+  assert time.monotonic() - begin < 3
+  assert "\n" not in str(error.value)
+  os.close(theirs)
+
+
+def test_a_missing_port_or_package_is_one_line(monkeypatch):
+  with pytest.raises(DeviceError, match="could not open port /dev/nothing") as error:
+    driver.connect("/dev/nothing")
+  assert "\n" not in str(error.value)
+  monkeypatch.setitem(sys.modules, "dynamixel_sdk", None)
+  with pytest.raises(DeviceError, match="robot needs dynamixel-sdk: pip install"):
+    driver.connect("/dev/nothing")
+
+
+def test_the_checksums_are_those_of_the_protocols():
+  rng = np.random.default_rng(0)
+  for size in (1, 8, 40):
+    data = rng.integers(0, 256, size).tolist()
+    assert crc(bytes(data)) == sdk.PacketHandler(2.0).updateCRC(0, data, size)
+  assert modbus_crc(b"123456789") == 0x4B37  # The check value of CRC-16/MODBUS.
+  assert math.isclose(TICK, 0.0015339807878856412)  # ``rh_p12_rn.model`` of ROBOTIS

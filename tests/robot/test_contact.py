@@ -1,0 +1,95 @@
+"""The virtual arm in contact with walls: stable where predicted, and only there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from apnpql_jax.robot.arm_model import ArmModel
+from apnpql_jax.robot.contact import FILTER_S, stiffness_limit
+from apnpql_jax.robot.limits import TIMESTEP
+from apnpql_jax.robot.virtual_arm import FORCE_DEAD_ZONE, Admittance, VirtualArm
+from apnpql_jax.sim.motors import VELOCITY_GAIN
+
+NEUTRAL = np.array([-1.8957, -1.7712, 1.9888, -1.7884, -1.5708, -0.3249])
+MODEL = ArmModel()
+UP = np.array([0.0, 0.0, 1.0])
+STILL = MODEL.dynamics(NEUTRAL, np.zeros(6))
+PRESS, KICK = 0.5, 0.05  # N beyond the dead zone, and of the disturbance
+NEAR = 0.1  # Relative distance from the predicted limit that the sweep leaves out.
+
+
+def swing(stiffness: float, lag: float, admittance: Admittance, seconds: float):
+  """Returns the swing of the force (N) at the end, after a small disturbance.
+
+  A linear wall pushes the tool up, and the policy presses just so much that it rests.
+  """
+  arm = VirtualArm(MODEL, admittance=admittance)
+  arm.reset(NEUTRAL)
+  rest = FORCE_DEAD_ZONE + PRESS
+  arm._wrench[:3] = rest * UP  # As after a long time of contact.
+  desired = -np.linalg.solve(STILL.mass, STILL.tool[:3].T @ UP) * PRESS / VELOCITY_GAIN
+  assert np.abs(VELOCITY_GAIN * desired).max() < 1.2
+  height = MODEL.tool_position(NEUTRAL)[2]
+  heights = [height] * (1 + round(lag / TIMESTEP))
+  forces, wrench = [], np.zeros(6)
+  for cycle in range(round(seconds / TIMESTEP)):
+    kick = KICK if cycle < 5 else 0.0
+    wrench[2] = rest + kick - stiffness * (heights[0] - height)
+    forces.append(wrench[2])
+    before = arm.position
+    arm.step(desired, None, wrench)
+    # As the core does, which leaves out the lead.
+    arm.synchronize(before + TIMESTEP * arm.velocity, arm.velocity)
+    heights = [*heights[1:], MODEL.tool_position(arm.position)[2]]
+  return np.ptp(forces[-round(0.5 / TIMESTEP) :])
+
+
+def check(stiffness: float, lag: float, admittance: Admittance) -> bool | None:
+  """Compares motion and prediction; returns which, or None near the limit."""
+  limit = stiffness_limit(STILL, UP, admittance, lag)
+  if abs(stiffness / limit - 1) < NEAR:
+    return None
+  stable = bool(stiffness < limit)
+  found = swing(stiffness, lag, admittance, 4.0)
+  assert (found < KICK) == stable, (stiffness, lag, found, limit)
+  return stable
+
+
+@pytest.mark.parametrize("lag", [0.002, 0.01, 0.03, 0.06])
+def test_stable_walls_are_the_predicted_ones(lag):
+  outcomes = [check(k, lag, Admittance()) for k in (1e3, 1e4, 5e4)]
+  assert True in outcomes and (False in outcomes or lag < 0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("damping_for", [2e3, 1e4, 3e4])
+def test_stable_walls_are_the_predicted_ones_everywhere(damping_for):
+  outcomes = [
+    check(k, lag, Admittance(stiffness=damping_for))
+    for k in np.geomspace(1e3, 5e4, 10)
+    for lag in (0.002, 0.006, 0.01, 0.016, 0.024, 0.034, 0.046, 0.06)
+  ]
+  assert outcomes.count(True) > 10
+  assert outcomes.count(False) > 3 or damping_for > 1e4  # D_c bears all walls.
+
+
+def test_the_designed_stiffness_is_stable_without_the_motors():
+  """D_c = 1.5 k tau alone, whatever the mass: poses, directions, and lags up to tau."""
+  rng, admittance = np.random.default_rng(0), Admittance()
+  for _ in range(20):
+    pose = NEUTRAL + rng.uniform(-0.5, 0.5, 6)
+    dynamics = MODEL.dynamics(pose, np.zeros(6))
+    direction = rng.normal(size=3)
+    direction /= np.linalg.norm(direction)
+    lag = rng.uniform(0.0, admittance.lag - FILTER_S)
+    limit = stiffness_limit(dynamics, direction, admittance, lag, saturated=True)
+    assert limit > 1.5 * admittance.stiffness
+    assert limit > admittance.damping / (lag + FILTER_S)
+
+
+def test_without_damping_a_soft_wall_is_unstable():
+  """The lag that a position-controlled arm has makes D_c necessary."""
+  soft = Admittance(stiffness=1.0)
+  assert stiffness_limit(STILL, UP, soft, 0.03) < 5_000
+  assert check(1e4, 0.03, soft) is False

@@ -1,0 +1,283 @@
+"""Faults bring a lagging arm to rest in half a second, and contacts stay stable."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import dataclasses
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+
+from apnpql_jax.robot.arm_model import ArmModel
+from apnpql_jax.robot.core import Command, Core
+from apnpql_jax.robot.limits import BRAKING, TIMESTEP, Limits
+from apnpql_jax.robot.protocols import ArmState
+from apnpql_jax.robot.supervisor import Action, Mode
+from apnpql_jax.robot.virtual_arm import LEAD, Admittance, VirtualArm
+
+NEUTRAL = np.array([-1.8957, -1.7712, 1.9888, -1.7884, -1.5708, -0.3249])
+MODEL = ArmModel()
+LIMITS = Limits(
+  box=np.array([[0.2, 0.8], [-0.5, 0.5], [0.0, 0.6]]),
+  joints=np.array([[-6.2, 6.2]] * 6),
+)
+PERIOD = 75  # cycles
+REST = 1e-3  # rad/s
+
+
+@dataclasses.dataclass
+class World:
+  """A lagging arm, the core, and a policy that acts every period; time in cycles."""
+
+  lag: float = 0.03
+  cycle: int = 0
+
+  def __post_init__(self):
+    self.core = Core(LIMITS, model=MODEL, admittance=Admittance())
+    self.arm, self.speed, self.wrench = NEUTRAL.copy(), np.zeros(6), np.zeros(6)
+    self.action: Action | None = None
+    self.measured_at: float | None = None
+    self.core.start(0.0, self.state())
+
+  @property
+  def now(self) -> float:
+    return 100 + self.cycle * TIMESTEP
+
+  def state(self, fault: str = "") -> ArmState:
+    time = self.now if self.measured_at is None else self.measured_at
+    return ArmState(time, self.arm.copy(), self.speed, self.wrench, fault)
+
+  def act(self, values: np.ndarray, frame_age: float = 0.03) -> None:
+    number = self.action.number + 1 if self.action else 1
+    frames = np.array([self.now - 0.03, self.now - frame_age])
+    self.action = Action(number, self.now, np.asarray(values, float), frames)
+
+  def step(self, fault: str = "") -> Command:
+    command = self.core.step(self.now, self.state(fault), self.action)
+    before = self.arm
+    self.arm = before + (TIMESTEP / self.lag) * (command.position - before)
+    self.speed = (self.arm - before) / TIMESTEP
+    self.cycle += 1
+    return command
+
+  def play(self, policy: Callable[[int], np.ndarray], cycles: int) -> list[Command]:
+    commands = []
+    for cycle in range(cycles):
+      if cycle % PERIOD == 0:
+        self.act(policy(cycle // PERIOD))
+      commands.append(self.step())
+    return commands
+
+
+FAST = np.array([1.0, 0.3, -0.3, 0.2, 0.2, 1.0, 0.0])
+
+
+def moving() -> World:
+  """Returns a world whose arm moves at nearly 1 rad/s, just after an action."""
+  world = World()
+  world.core.start(world.now, world.state())
+  world.play(lambda _: FAST, 6 * PERIOD)
+  world.act(FAST)
+  assert world.step().mode is Mode.FOLLOW
+  assert world.speed.max() > 0.7
+  return world
+
+
+def nan_action(world: World) -> None:
+  world.act(FAST * np.nan)
+
+
+def stale_frame(world: World) -> None:
+  world.act(FAST, frame_age=0.101)
+
+
+def frame_never_seen(world: World) -> None:
+  world.act(FAST, frame_age=np.nan)
+
+
+def stale_joints(world: World) -> None:
+  world.measured_at = world.now - 0.021
+
+
+def nan_joints(world: World) -> None:
+  world.arm = world.arm * np.nan
+
+
+def nan_wrench(world: World) -> None:
+  world.wrench = np.full(6, np.nan)
+
+
+def push(force: float) -> Callable[[World], None]:
+  def cause(world: World) -> None:
+    world.wrench = np.array([0, force, 0, 0, 0, 0.0])
+
+  return cause
+
+
+def silent_policy(world: World) -> None:
+  world.cycle += 2 * PERIOD  # The arm coasts meanwhile, in this world without time.
+
+
+def killed_policy(world: World) -> None:
+  world.core.supervisor.stop("policy: its process has ended")
+
+
+FAULTS = {
+  "policy: the action is not finite": (nan_action, Mode.HOLD),
+  "camera wrist: frame is 101 ms old": (stale_frame, Mode.HOLD),
+  "camera wrist: frame is nan ms old": (frame_never_seen, Mode.HOLD),
+  "joints: measurement is 21 ms old": (stale_joints, Mode.STOP),
+  "arm: a measurement is not finite": (nan_joints, Mode.STOP),
+  "arm: a measurement is not finite ": (nan_wrench, Mode.STOP),
+  "force: above 30 N on the tool": (push(31), Mode.HOLD),
+  "force: 51 N on the tool": (push(-51), Mode.STOP),
+  "policy: a period late": (silent_policy, Mode.HOLD),
+  "policy: its process has ended": (killed_policy, Mode.STOP),
+}
+
+
+@pytest.mark.parametrize("reason", FAULTS)
+def test_at_rest_within_half_a_second_of_a_fault_with_its_reason(reason):
+  cause, mode = FAULTS[reason]
+  world = moving()
+  cause(world)
+  first = world.step()
+  assert first.mode == mode and first.reason == reason.strip()
+  for _ in range(round(0.5 / TIMESTEP) - 1):
+    last = world.step()
+    assert np.isfinite(last.position).all()
+  assert last.at_rest
+  if np.isfinite(world.arm).all():
+    assert np.abs(world.speed).max() < REST
+
+
+def test_a_lost_measurement_does_not_stop_the_command_abruptly():
+  world = moving()
+  speeds, frozen = [world.core.limiter.velocity], world.arm.copy()
+  while not world.core.limiter.at_rest:
+    state = ArmState(world.now - 0.03, frozen, np.zeros(6), np.zeros(6))
+    world.core.step(world.now, state, world.action)
+    speeds.append(world.core.limiter.velocity)
+    world.cycle += 1
+  changes = np.abs(np.diff(speeds, axis=0)).max()
+  assert changes <= BRAKING * TIMESTEP + 1e-9
+
+
+def test_a_blocked_arm_ends_the_command_near_it():
+  world = moving()
+  push(60)(world)
+  blocked = world.arm.copy()
+  for _ in range(250):
+    world.arm = blocked
+    command = world.core.step(world.now, world.state(), world.action)
+    assert np.abs(command.position - blocked).max() <= LIMITS.deviation + 1e-9
+    world.cycle += 1
+  assert command.at_rest
+
+
+def test_a_protective_stop_of_the_arm_stops():
+  world = moving()
+  command = world.step(fault="protective stop")
+  assert (command.mode, command.reason) == (Mode.STOP, "arm: protective stop")
+  assert world.step().mode is Mode.STOP  # It stays.
+
+
+def test_a_period_late_holds_and_two_stop():
+  world = moving()
+  modes = {}
+  for cycle in range(1, 4 * PERIOD):
+    modes[cycle] = world.step()
+  held = [c for c, x in modes.items() if x.mode is Mode.HOLD]
+  stopped = [c for c, x in modes.items() if x.mode is Mode.STOP]
+  assert abs(held[0] - 2 * PERIOD) <= 2 and abs(stopped[0] - 3 * PERIOD) <= 2
+  assert modes[stopped[0]].reason == "policy: two periods late"
+
+
+def test_a_hold_ends_with_its_cause_and_a_stop_does_not():
+  world = moving()
+  nan_action(world)
+  assert world.step().mode is Mode.HOLD
+  world.act(FAST)
+  assert world.step().mode is Mode.FOLLOW
+  stale_joints(world)
+  assert world.step().mode is Mode.STOP
+  world.measured_at = None
+  world.act(FAST)
+  assert world.step().mode is Mode.STOP
+
+
+def test_actions_that_are_never_valid_stop():
+  world = moving()
+  modes = [x.mode for x in world.play(lambda _: np.full(7, np.inf), 4 * PERIOD)]
+  assert modes[0] is Mode.HOLD and modes[-1] is Mode.STOP
+
+
+def test_a_jam_stops_and_a_hit_only_holds():
+  world = moving()
+  push(35)(world)
+  world.play(lambda _: FAST, 20)
+  push(0)(world)
+  modes = [x.mode for x in world.play(lambda _: FAST, 150)]
+  assert modes[0] is Mode.HOLD and modes[-1] is Mode.FOLLOW
+  push(35)(world)
+  last = world.play(lambda _: FAST, 600)[-1]
+  assert (last.mode, last.reason) == (Mode.STOP, "force: 35 N on the tool for 1 s")
+
+
+def test_no_first_action_holds_then_stops():
+  world = World()
+  world.core.start(world.now, world.state())
+  assert world.step().reason == "policy: no action yet"
+  world.cycle += round(5.1 / TIMESTEP)
+  assert world.step().reason == "policy: no action within 5 s"
+
+
+def test_an_arm_that_runs_away_stops():
+  world = moving()
+  world.arm = world.arm + 0.1
+  command = world.step()
+  assert command.mode is Mode.STOP and "rad from its command" in command.reason
+
+
+@settings(max_examples=10, deadline=None)
+@given(
+  seed=st.integers(0, 2**32 - 1),
+  lag=st.floats(0.002, 0.06),
+  noise=st.sampled_from([0.0, 0.5, 5.0]),
+)
+def test_commands_keep_the_limits_for_every_policy_and_contact(seed, lag, noise):
+  """A policy of any numbers, a lagging arm, and wrenches that do not fit the motion."""
+  rng = np.random.default_rng(seed)
+  world = World(lag)
+  world.core.start(world.now, world.state())
+  before = NEUTRAL
+  for cycle in range(20 * PERIOD):
+    if cycle % PERIOD == 0:
+      scale = rng.choice([0.5, 1.0, 1e3, np.nan], p=[0.4, 0.4, 0.15, 0.05])
+      world.act(rng.uniform(-1, 1, 7) * scale)
+    if cycle % 25 == 0:
+      world.wrench = noise * rng.normal(size=6)
+    command = world.step()
+    assert np.abs(command.position - before).max() <= TIMESTEP * (1 + 1e-9)
+    assert np.abs(command.position - world.arm).max() <= LIMITS.deviation * 1.05
+    tool = MODEL.tool_position(command.position)
+    assert (tool >= LIMITS.box[:, 0]).all() and (tool <= LIMITS.box[:, 1]).all()
+    before = command.position
+
+
+def test_free_motion_through_the_limits_is_that_of_the_virtual_arm():
+  """It is later by the lead, with which training exceeds its limit of acceleration."""
+  rng = np.random.default_rng(1)
+  actions = 0.5 * rng.uniform(-1, 1, (20, 7))
+  world, alone = World(lag=0.01), VirtualArm(MODEL)
+  world.core.start(world.now, world.state())
+  alone.reset(NEUTRAL)
+  for action in actions:
+    world.act(action)
+    for _ in range(PERIOD):
+      world.step()
+      alone.step(action[:6])
+    delayed = alone.position - LEAD * alone.velocity
+    np.testing.assert_allclose(world.core.limiter.position, delayed, atol=1e-4)
+    np.testing.assert_allclose(world.core.limiter.velocity, alone.velocity, atol=1e-4)

@@ -1,0 +1,108 @@
+"""Whole runs of the command on the simulated robot, with a real exported policy."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from apnpql_jax import testing
+from apnpql_jax.data import lerobot
+from apnpql_jax.testing import export_untrained
+
+ROBOT = ["--robot", "simulated", "--policy", "policy", "--slowdown", "8"]
+
+
+def start(*args: str, cwd: Path) -> subprocess.Popen[str]:
+  """Starts ``apnpql robot`` in a process of its own."""
+  return subprocess.Popen(
+    [sys.executable, "-m", "apnpql_jax", "robot", *args],
+    cwd=cwd,
+    stdout=subprocess.PIPE,
+    stderr=subprocess.PIPE,
+    text=True,
+    start_new_session=True,
+  )
+
+
+def output(*args: str, cwd: Path) -> tuple[str, str]:
+  """Returns standard output and standard error of a command that succeeds."""
+  process = start(*args, cwd=cwd)
+  shown, errors = process.communicate(timeout=1200)
+  assert process.returncode == 0, errors
+  return shown, errors
+
+
+def is_orderly(reason: str) -> bool:
+  """Returns whether an untrained policy may end an episode so."""
+  return reason == "time limit" or reason.startswith(("force: ", "arm: ", "policy: "))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+  """Returns a folder with a policy."""
+  found = tmp_path_factory.mktemp("robot")
+  export_untrained(found / "policy", time_limit_s=2.4)
+  return found
+
+
+@pytest.fixture(autouse=True)
+def this_checkout(monkeypatch) -> None:
+  """Lets processes import this checkout."""
+  path = os.pathsep.join([str(testing.ROOT), os.environ.get("PYTHONPATH", "")])
+  monkeypatch.setenv("PYTHONPATH", path)
+
+
+@pytest.mark.slow
+def test_an_untrained_policy_plays_its_episodes_in_order(folder):
+  pytest.importorskip("pyarrow")
+  shown, _ = output("check", *ROBOT, cwd=folder)
+  for name in ("arm", "gripper", "camera global", "camera wrist", "admittance"):
+    assert f"\n{name} " in f"\n{shown}"
+  assert "inside the workspace box" in shown
+
+  args = "run", *ROBOT, "--episodes", "2", "--json"
+  shown, errors = output(*args, "--log", "log", cwd=folder)
+  found = json.loads(shown)
+  assert found["episodes"] == 2 and found["successes"] == 0
+  assert all(map(is_orderly, found["reasons"])) and found["actions"] >= 2
+  for number in (1, 2):
+    assert sum(f"episode {number} of 2: " in x for x in errors.splitlines()) == 1
+
+  lines = (folder / "log" / "episodes.jsonl").read_text().splitlines()
+  kept = [json.loads(line) for line in lines]
+  assert [x["reason"] for x in kept] == found["reasons"]
+  first = lerobot.read(folder / "log").episodes[0]
+  assert len(first.actions) == kept[0]["actions"]
+  assert np.abs(first.actions[:, :6]).max() <= 1
+
+  shown, _ = output(
+    *args[:-3], "--episodes", "1", "--replay", "log", "--json", cwd=folder
+  )
+  assert is_orderly(json.loads(shown)["reasons"][0])
+
+
+@pytest.mark.slow
+def test_an_interrupt_brings_the_arm_to_rest_and_ends_all_processes(folder):
+  process = start("run", *ROBOT, "--episodes", "50", cwd=folder)
+  assert process.stderr is not None
+  while "episode 1 of 50" not in (line := process.stderr.readline()):
+    assert line, "it ended"
+  time.sleep(8.0)  # Into the next episode, or on the way to it.
+  process.send_signal(signal.SIGINT)
+  _, errors = process.communicate(timeout=120)
+  assert process.returncode == 128 + signal.SIGINT
+  assert "SIGINT: the arm is at rest" in errors and "Traceback" not in errors
+  assert "leaked" not in errors
+  # The resource tracker of Python notices the end a moment later.
+  until = time.monotonic() + 20
+  while subprocess.run(["pgrep", "-s", str(process.pid)], capture_output=True).stdout:
+    assert time.monotonic() < until
+    time.sleep(0.2)
