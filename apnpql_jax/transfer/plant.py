@@ -86,7 +86,9 @@ class Plant:
     self._limit = model.actuator_ctrlrange[:, 1]
     self._flange_body = int(model.site(FLANGE).bodyid[0])
     self._hand = {
-      link for body, (_, link) in bodies.place.items() if body > self._flange_body
+      link
+      for body, (loaded, link) in bodies.place.items()
+      if loaded == bodies.robot and body > self._flange_body
     }
     self._finger = bodies.joints[finger]
     self._touch(model)
