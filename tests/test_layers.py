@@ -13,7 +13,7 @@ NAME = PACKAGE.name
 STAIR = (
   "errors types atomic console runtime dists config devices sim render tasks templates "
   "randomization primitives envs gym agents data runs reports sweeps training viewing "
-  "deploy transfer robot testing doctor cli __main__"
+  "deploy robot transfer testing doctor cli __main__"
 ).split()
 """Rooms from the bottom up: each imports only from itself and from earlier ones."""
 
