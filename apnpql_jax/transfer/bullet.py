@@ -17,7 +17,6 @@ import numpy as np
 
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.transfer import urdf
-from apnpql_jax.transfer.hulls import hull_of
 
 
 def require(option: str) -> None:
@@ -63,8 +62,8 @@ def _quiet() -> Generator[None]:
 class Bodies:
   """The bodies of a MuJoCo model in a simulator."""
 
-  def __init__(self, client: Any, model: mujoco.MjModel, *, hulls: bool = False):
-    """Loads one URDF file per tree of bodies, with ``hulls`` of boxes if wanted."""
+  def __init__(self, client: Any, model: mujoco.MjModel):
+    """Loads one URDF file per tree of bodies."""
     self.client, self.model = client, model
     self.place: dict[int, tuple[int, int]] = {}
     """By body: PyBullet's body and its link, -1 for the base."""
@@ -73,11 +72,8 @@ class Bodies:
     self._offsets: dict[int, tuple[Any, Any]] = {}  # Of centers of mass.
     with tempfile.TemporaryDirectory() as folder:
       for root in urdf.roots(model):
-        path, meshes = Path(folder) / f"{root}.urdf", {}
-        if hulls and urdf.is_free(model, root) and (mesh := hull_of(model, root)):
-          path.with_suffix(".obj").write_text(mesh)
-          meshes[root] = f"{root}.obj"
-        path.write_text(urdf.write(model, root, meshes))
+        path = Path(folder) / f"{root}.urdf"
+        path.write_text(urdf.write(model, root))
         self._load(root, path)
     self.robot = next(self.place[int(model.jnt_bodyid[j])][0] for j in self.joints)
 

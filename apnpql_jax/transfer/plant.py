@@ -24,7 +24,10 @@ from apnpql_jax.sim.scene import Scene
 from apnpql_jax.transfer import bullet, contacts
 
 ITERATIONS = 300
-"""Iterations of Bullet's solver; a step takes 2 ms, as a cycle of the servos."""
+"""Iterations of Bullet's solver, which makes a step of 2 ms per command of the servos.
+
+With 100, a cup creeps between the pads and slowly pushes the hand open.
+"""
 
 SERVO_GAIN = 0.1
 """Share of the position error that a servo removes in a step."""
@@ -41,7 +44,7 @@ GEAR_FORCE = 100.0
 FINGER_INERTIA = 0.1
 """Share of the fingers' armature that their links get.
 
-With none, the solver converges badly in a grip, and the fingers differ.
+With none, the solver is far from converged in a grip, and the gears give way.
 """
 
 GEAR_ERP = 0.2
@@ -79,7 +82,7 @@ class Plant:
     client.setPhysicsEngineParameter(
       fixedTimeStep=TIMESTEP, numSolverIterations=ITERATIONS
     )
-    self.bodies = bodies = bullet.Bodies(client, model, hulls=True)
+    self.bodies = bodies = bullet.Bodies(client, model)
     bodies.reset(qpos, mocap_pos, mocap_quat)
     arm, finger = model.actuator_trnid[:6, 0], int(model.actuator_trnid[6, 0])
     self._arm = [bodies.joints[int(joint)] for joint in arm]

@@ -5,7 +5,7 @@ them for contact, of collisions. Armature, equalities, actuators and contact par
 are left out, because URDF cannot express them.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 import warnings
 
 import mujoco
@@ -21,17 +21,10 @@ def roots(model: mujoco.MjModel) -> list[int]:
   return [0, *np.flatnonzero(model.body_parentid[1:] == 0) + 1]
 
 
-def write(
-  model: mujoco.MjModel, root: int, meshes: Mapping[int, str] | None = None
-) -> str:
+def write(model: mujoco.MjModel, root: int) -> str:
   """Returns the URDF of a body and its descendants; of the world, only its geoms.
 
   Links are named "body_<id>" and joints "joint_<id>", by the ids of MuJoCo.
-
-  Args:
-    model: The compiled model.
-    root: The body.
-    meshes: Files that take the place of the collision shapes of some bodies.
 
   Raises:
     ValueError: URDF cannot express a joint or a shape.
@@ -40,26 +33,23 @@ def write(
   for body in range(root + 1, model.nbody if root else 0):
     if model.body_parentid[body] in bodies:
       bodies.append(body)
-  meshes = meshes or {}
-  parts = [_link(model, body, meshes.get(body)) for body in bodies]
+  parts = [_link(model, body) for body in bodies]
   parts += [_joint(model, body) for body in bodies[1:]]
   return f'<robot name="tree_{root}">\n' + "\n".join(parts) + "\n</robot>\n"
 
 
-def _link(model: mujoco.MjModel, body: int, mesh: str | None) -> str:
+def _link(model: mujoco.MjModel, body: int) -> str:
   xx, yy, zz = model.body_inertia[body]
   inertial = (
     f"<inertial>{_origin(model.body_ipos[body], model.body_iquat[body])}"
     f'<mass value="{model.body_mass[body]}"/><inertia ixx="{xx}" iyy="{yy}" '
     f'izz="{zz}" ixy="0" ixz="0" iyz="0"/></inertial>'
   )
-  shapes = "\n".join(_shapes(model, body, mesh))
+  shapes = "\n".join(_shapes(model, body))
   return f'<link name="body_{body}">{inertial}\n{shapes}</link>'
 
 
-def _shapes(model: mujoco.MjModel, body: int, mesh: str | None) -> Iterator[str]:
-  if mesh:
-    yield f'<collision><geometry><mesh filename="{mesh}"/></geometry></collision>'
+def _shapes(model: mujoco.MjModel, body: int) -> Iterator[str]:
   first = model.body_geomadr[body]
   for geom in range(first, first + model.body_geomnum[body]):
     shape = _shape(model, geom)
@@ -68,7 +58,7 @@ def _shapes(model: mujoco.MjModel, body: int, mesh: str | None) -> Iterator[str]
       color = f'<color rgba="{_numbers(rgba)}"/>'
       material = f'<material name="geom_{geom}">{color}</material>'
       yield f"<visual>{shape}{material}</visual>"
-    if not mesh and (geom in model.pair_geom1 or geom in model.pair_geom2):
+    if geom in model.pair_geom1 or geom in model.pair_geom2:
       yield f"<collision>{shape}</collision>"
 
 

@@ -19,7 +19,6 @@ from apnpql_jax.tasks.pinch import finger_angle, pinch_height
 from apnpql_jax.tasks.stack_box import SIDE
 from apnpql_jax.transfer import bullet, contacts
 from apnpql_jax.transfer.cell import Cell
-from apnpql_jax.transfer.hulls import hull_of
 from apnpql_jax.transfer.plant import Plant, with_fields
 
 PERIOD_S = 0.15
@@ -226,39 +225,6 @@ def test_nothing_pushes_a_hand_in_the_air(plant):
   begin(plant, closed=True)
   plant.step(np.zeros(6), 1.0, PERIOD_S)
   np.testing.assert_array_equal(plant.wrench(), 0)
-
-
-@pytest.mark.parametrize(
-  ("name", "body"), [("place_plate", "plate"), ("flip_cup", "cup")]
-)
-def test_overlapping_boxes_are_one_hull_of_the_same_size(name, body):
-  pytest.importorskip("pybullet")
-  model, sizes = make_task(name).scene.model, {}
-  for hulls in (False, True):
-    client = bullet.connect()
-    bodies = bullet.Bodies(client, model, hulls=hulls)
-    place = bodies.place[model.body(body).id]
-    assert len(client.getCollisionShapeData(*place)) == (1 if hulls else 4)
-    low, high = map(np.array, client.getAABB(*place))
-    sizes[hulls] = high - low
-    client.disconnect()
-  np.testing.assert_allclose(sizes[True], sizes[False], atol=3e-3)
-
-
-@pytest.mark.parametrize(
-  "second", ["size='0.01 0.05 0.01'", "type='sphere' size='0.01'", "pos='1 0 0'"]
-)
-def test_other_objects_keep_their_shapes(second):
-  """A cross, a box with a sphere, two boxes apart: a hull would be larger."""
-  model = mujoco.MjModel.from_xml_string(
-    "<mujoco><default><geom type='box' size='0.05 0.01 0.01'/></default><worldbody>"
-    "<geom name='table' type='plane' size='1 1 1'/><body pos='0 0 1'><freejoint/>"
-    f"<geom name='a'/><geom name='b' {second}/></body></worldbody><contact>"
-    "<pair geom1='table' geom2='a'/><pair geom1='table' geom2='b'/></contact></mujoco>"
-  )
-  assert hull_of(model, 1) is None
-  assert hull_of(make_task("stack_box").scene.model, 14) is None  # One box each.
-  assert hull_of(make_task("push_plate").scene.model, 15) is None  # A rim.
 
 
 def test_frictions_of_the_pairs_become_factors():
