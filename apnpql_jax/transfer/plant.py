@@ -110,6 +110,7 @@ class Plant:
     """Runs a control period with desired joint velocities f64[6], rad/s."""
     late = float(self._fields.get("control_delay", 0.0)) * self.scene.model.opt.timestep
     now = (np.asarray(velocity, float), float(close))
+    self._forget_contacts()
     for command in range(round(period_s / TIMESTEP)):
       self._drive(*(self._last if command * TIMESTEP < late else now))
       self._client.stepSimulation()
@@ -165,6 +166,15 @@ class Plant:
       targetVelocity=self._finger_rate(finger[0], close),
       force=self._limit[6],
     )
+
+  def _forget_contacts(self) -> None:
+    """Lets Bullet find the contacts of the hand again.
+
+    It keeps the normals of contacts that last in the axes of the world. When the hand
+    turns an object over, old ones would push the wrong way, and fingers not let go.
+    """
+    for link in self._hand:
+      self._client.setCollisionFilterGroupMask(self.bodies.robot, link, 1, -1)
 
   def _finger_rate(self, angle: float, close: float) -> float:
     speed = float(self._fields.get("gripper_speed", motors.GRIPPER_SPEED))
