@@ -51,6 +51,10 @@ GEAR_ERP = 0.2
 """Share of a gear's error that Bullet removes in a step."""
 
 
+REFRESH = 75
+"""Cycles after which Bullet finds the contacts of the hand again: 0.15 s."""
+
+
 class Plant:
   """One world; ``begin`` starts an episode."""
 
@@ -104,14 +108,17 @@ class Plant:
     # The command before the present one gives its speed.
     self._sent = deque([angles] * (self._delay + 2), self._delay + 2)
     self._measured = angles
+    self._cycles = 0
     self._last = np.zeros(6), float(qpos[scene.gripper_qpos] > 0.5)
 
   def step(self, velocity: np.ndarray, close: float, period_s: float) -> None:
     """Runs a control period with desired joint velocities f64[6], rad/s."""
     late = float(self._fields.get("control_delay", 0.0)) * self.scene.model.opt.timestep
     now = (np.asarray(velocity, float), float(close))
-    self._forget_contacts()
     for command in range(round(period_s / TIMESTEP)):
+      self._cycles += 1
+      if self._cycles % REFRESH == 0:
+        self._forget_contacts()
       self._drive(*(self._last if command * TIMESTEP < late else now))
       self._client.stepSimulation()
       states = self._client.getJointStates(self.bodies.robot, self._arm)
