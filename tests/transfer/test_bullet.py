@@ -201,6 +201,32 @@ def test_pads_hold_a_box_that_the_arm_lifts(plant):
   np.testing.assert_allclose(data.qpos[at : at + 3], moved, atol=3e-3)
 
 
+def test_contacts_turn_with_the_hand(plant):
+  """After half a turn with a box, all contacts push the pads apart."""
+  qpos = begin(plant)
+  model, data = plant.scene.model, mujoco.MjData(plant.scene.model)
+  qpos[6:10] = finger_angle(SIDE)
+  data.qpos[:] = qpos
+  mujoco.mj_kinematics(model, data)
+  at, _ = plant.scene.free_joint("yellow")
+  tool, quat = data.site("tool"), np.zeros(4)
+  mujoco.mju_mat2Quat(quat, tool.xmat)
+  pads = tool.xpos - float(pinch_height(SIDE)) * tool.xmat.reshape(3, 3)[:, 2]
+  qpos[at : at + 7] = [*pads, *quat]
+  plant.begin(qpos, data.mocap_pos, data.mocap_quat, {})
+  for _ in range(26):
+    plant.step(np.array([0, 0, 0, 0, 0, 1.0]), 1.0, PERIOD_S)
+  plant.step(np.zeros(6), 1.0, 0.02)
+  bodies, pushes = plant.bodies, []
+  for name, sign in (("r2", 1), ("l2", -1)):
+    place = bodies.place[model.body(name).id]
+    outward = sign * bodies.pose(model.body("gripper").id)[1][:, 1]
+    box = bodies.place[model.body("yellow").id][0]
+    for contact in bodies.client.getContactPoints(bodies.robot, box, place[1]):
+      pushes.append(np.dot(contact[7], outward))
+  assert len(pushes) >= 4 and min(pushes) > 0.9
+
+
 def test_admittance_yields_to_the_table(scene):
   """The hand moves down onto it and slides away from the base."""
   pytest.importorskip("pybullet")
