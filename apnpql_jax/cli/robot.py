@@ -146,9 +146,9 @@ def _calibrate(args: Robot, opened: Any) -> dict[str, Any]:
   """Calibrates the cameras of a cell; the arm only moves by hand."""
   if (out := opened.cell.calibration) is None:
     raise ConfigError("only the cameras of --robot ur5e need a calibration")
-  from apnpql_jax.robot.calibration import boards, command
+  from apnpql_jax.robot.calibration import boards, live
 
-  return command.calibrate_cell(
+  return live.calibrate_cell(
     opened.contract,
     args.views,
     out,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,12 +16,14 @@ import pytest
 from apnpql_jax.data import lerobot
 from apnpql_jax.errors import ConfigError, FileError, UserError
 
+pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
 STATE = [f"joint_{i}" for i in range(7)]
 WRENCH = "observation.wrench"
 WIDE, SMALL = f"{lerobot.IMAGES}global", f"{lerobot.IMAGES}wrist"
 SIZES = {WIDE: (48, 64), SMALL: (30, 53)}
+VECTORS = lerobot.STATE, lerobot.ACTION, WRENCH
 FPS = 1 / 0.15
 LENGTHS = (5, 9, 1)
 
@@ -95,6 +98,44 @@ def test_what_is_written_is_read(written):
       for image, frame in zip(images, expected, strict=True):
         assert image.shape == frame[name].shape
         assert abs(image.astype(int) - frame[name]).mean() < 2
+
+
+def test_episodes_may_share_a_file(written, tmp_path):
+  """As LeRobot writes them; its lists are of any length, and names may be in groups."""
+  folder = tmp_path / "dataset"
+  shutil.copytree(written[0], folder)
+  paths = sorted((folder / "data").rglob("*.parquet"))
+  table = pa.concat_tables([pq.read_table(path) for path in paths])
+  loose = pa.schema(
+    [
+      pa.field(x.name, pa.list_(pa.float32()) if x.name in VECTORS else x.type)
+      for x in table.schema
+    ]
+  )
+  for path in paths[1:]:
+    path.unlink()
+  pq.write_table(table.cast(loose), paths[0])
+  for path in (folder / "meta/episodes").rglob("*.parquet"):
+    (row,) = pq.read_table(path).to_pylist()
+    pq.write_table(pa.Table.from_pylist([row | {"data/file_index": 0}]), path)
+  _damage(
+    folder,
+    "meta/info.json",
+    lambda data: json.dumps(_in_groups(json.loads(data))).encode(),
+  )
+  for a, b in zip(
+    lerobot.read(folder).episodes, lerobot.read(written[0]).episodes, strict=True
+  ):
+    for name in VECTORS:
+      np.testing.assert_array_equal(a.columns[name], b.columns[name])
+    assert a.success == b.success and a.task == b.task
+  assert lerobot.read(folder).names == lerobot.read(written[0]).names
+
+
+def _in_groups(info: dict) -> dict:
+  for name in VECTORS:
+    info["features"][name]["names"] = {"motors": info["features"][name]["names"]}
+  return info
 
 
 def test_the_files_are_those_of_the_format(written):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from fractions import Fraction
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,9 +11,10 @@ import av
 import numpy as np
 
 from apnpql_jax.atomic import check_writable, replacing
-from apnpql_jax.data.lerobot import layout, statistics
+from apnpql_jax.data.lerobot import layout, statistics, tables
 from apnpql_jax.data.lerobot.layout import COUNTERS, SUCCESS, Json
-from apnpql_jax.data.lerobot.statistics import Pixels, Stats
+from apnpql_jax.data.lerobot.statistics import Stats
+from apnpql_jax.data.lerobot.video import Video
 from apnpql_jax.errors import FileError, one_line
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class Writer:
     self._stats: dict[str, Stats] = {}
     self._episodes = self._frames = 0
     self._rows: dict[str, list[np.ndarray]] = {}
-    self._videos: dict[str, _Video] = {}
+    self._videos: dict[str, Video] = {}
     check_writable(self.folder)
     if self.folder.exists() and (
       not self.folder.is_dir() or any(self.folder.iterdir())
@@ -106,7 +106,7 @@ class Writer:
     try:
       for name in self._images:
         if name not in self._videos:
-          self._videos[name] = _Video(self._part(name), self._images[name], self._fps)
+          self._videos[name] = Video(self._part(name), self._images[name], self._fps)
         self._videos[name].add(np.asarray(frame[name]))
     except (OSError, av.FFmpegError) as error:
       raise self._failed(error) from None
@@ -155,9 +155,9 @@ class Writer:
         earlier = self._stats.get(name)
         self._stats[name] = statistics.combined(earlier, found) if earlier else found
       # A reader believes the last of these files, so it comes last.
-      self._write_table(layout.DATA.format(**where), self._table(columns))
-      self._write_tasks()
-      self._write_table(layout.EPISODES.format(**where), _one_row(row))
+      self._write_table(layout.DATA.format(**where), tables.of_columns(columns))
+      self._write_table(layout.TASKS, tables.of_tasks(self._tasks))
+      self._write_table(layout.EPISODES.format(**where), tables.of_row(row))
       self._write_json(
         layout.STATS,
         {
@@ -198,58 +198,6 @@ class Writer:
       columns[name] = counters[name].astype(kind)[:, None]
     return columns
 
-  def _table(self, columns: dict[str, np.ndarray]) -> pa.Table:
-    import pyarrow as pa
-
-    arrays = {}
-    for name, values in columns.items():
-      flat = pa.array(values.ravel())
-      width = values.shape[1]
-      # LeRobot stores columns of one number as numbers.
-      arrays[name] = (
-        flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
-      )
-    return pa.table(arrays)
-
-  def _write_tasks(self) -> None:
-    """Writes the tasks as pandas does, with their texts as index."""
-    import pyarrow as pa
-
-    kinds = {"task_index": ("int64", "int64"), "task": ("unicode", "object")}
-    about = {
-      "index_columns": ["task"],
-      "column_indexes": [
-        {
-          "name": None,
-          "field_name": None,
-          "pandas_type": "unicode",
-          "numpy_type": "object",
-          "metadata": {"encoding": "UTF-8"},
-        }
-      ],
-      "columns": [
-        {
-          "name": name,
-          "field_name": name,
-          "pandas_type": pandas,
-          "numpy_type": numpy,
-          "metadata": None,
-        }
-        for name, (pandas, numpy) in kinds.items()
-      ],
-      "creator": {"library": "pyarrow", "version": pa.__version__},
-      "pandas_version": "2.2.0",
-    }
-    table = pa.table(
-      {
-        "task_index": pa.array(range(len(self._tasks)), pa.int64()),
-        "task": pa.array(self._tasks, pa.string()),
-      }
-    )
-    self._write_table(
-      layout.TASKS, table.replace_schema_metadata({"pandas": json.dumps(about)})
-    )
-
   def _write_info(self) -> None:
     self._write_json(
       layout.INFO,
@@ -281,42 +229,3 @@ class Writer:
 
   def _failed(self, error: Exception) -> FileError:
     return FileError(f"cannot write {str(self.folder)!r}: {one_line(error)}")
-
-
-class _Video:
-  """A video that is being written."""
-
-  def __init__(self, path: Path, size: tuple[int, int], fps: float):
-    self.pixels = Pixels()
-    self._path = path
-    self._file = av.open(str(path), "w", format="mp4")
-    self._stream = self._file.add_stream(
-      "libx264", Fraction(fps).limit_denominator(1000)
-    )
-    # Full color, for small images of odd sizes too; a key frame every other frame, so
-    # that any frame is soon read.
-    self._stream.height, self._stream.width = size
-    self._stream.pix_fmt = "yuv444p"
-    self._stream.options = {"crf": "10", "g": "2", "bf": "0", "preset": "veryfast"}
-
-  def add(self, image: np.ndarray) -> None:
-    """Adds u8[H, W, 3]."""
-    self.pixels.add(image)
-    self._file.mux(self._stream.encode(av.VideoFrame.from_ndarray(image)))
-
-  def finish(self, path: Path) -> None:
-    """Completes the file and gives it its name."""
-    self._file.mux(self._stream.encode())
-    self._file.close()
-    self._path.replace(path)
-
-  def discard(self) -> None:
-    """Removes the file."""
-    self._file.close()
-    self._path.unlink(missing_ok=True)
-
-
-def _one_row(row: Json) -> pa.Table:
-  import pyarrow as pa
-
-  return pa.Table.from_pydict({name: [value] for name, value in row.items()})

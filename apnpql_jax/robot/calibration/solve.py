@@ -1,14 +1,4 @@
-"""The pose of a camera from views of a board.
-
-Both cameras obey the same equation. With the flange's pose F in the world at a view,
-the board's corner p appears at the pixel
-
-    lens(X^-1 G Y p)
-
-For a camera on the wrist, X is the camera in the flange, Y the board in the world and
-G = F^-1. For a fixed camera and a board on the tool, X is the camera in the world, Y
-the board in the flange and G = F. For both fixed, G = 1, and Y must be known.
-"""
+"""The pose of a camera from views of a board; see ``problem`` for the equation."""
 
 from __future__ import annotations
 
@@ -16,12 +6,17 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from apnpql_jax.errors import ConfigError
-from apnpql_jax.robot.calibration.boards import Board, Seen, opencv
-from apnpql_jax.robot.calibration.lenses import Lens
+from apnpql_jax.robot.calibration.boards import opencv
+from apnpql_jax.robot.calibration.problem import (
+  Problem,
+  angle_deg,
+  deviations,
+  refine,
+  rms,
+)
 
 FEWEST_VIEWS = 8
 LEAST_TURN_DEG = 10.0
@@ -46,36 +41,6 @@ class Solution:
   kept: np.ndarray  # bool[views]: not an outlier
   method: str  # that gave the first guess
   residuals: dict[str, Any]
-
-
-@dataclasses.dataclass(frozen=True)
-class Problem:
-  """Views of a board: their corners, and the G of each."""
-
-  board: Board
-  lens: Lens
-  seen: list[Seen]
-  motion: np.ndarray  # f64[views, 4, 4]
-
-  def select(self, rows: np.ndarray) -> Problem:
-    """Returns the problem of some views."""
-    seen = [self.seen[i] for i in rows]
-    return dataclasses.replace(self, seen=seen, motion=self.motion[rows])
-
-  def errors(self, camera: np.ndarray, board: np.ndarray, scale: float = 1.0) -> list:
-    """Returns the errors in pixels of each view, f64[corners, 2]."""
-    inverse = np.linalg.inv(camera)
-    corners = scale * self.board.corners
-    found = []
-    for seen, motion in zip(self.seen, self.motion, strict=True):
-      pose = inverse @ motion @ board
-      points = corners[seen.ids] @ pose[:3, :3].T + pose[:3, 3]
-      found.append(self.lens.project(points) - seen.pixels)
-    return found
-
-  def error_of_views(self, camera: np.ndarray, board: np.ndarray) -> np.ndarray:
-    """Returns the root mean square error of each view in pixels."""
-    return np.array([_rms(x) for x in self.errors(camera, board)])
 
 
 def solve(problem: Problem) -> Solution:
@@ -187,7 +152,7 @@ def _without_outliers(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
   """Refines the poses, leaves out views that contradict them, and refines again."""
   kept, px_per_mrad = np.ones(len(problem.seen), bool), problem.lens.fx / 1e3
-  camera, board, _ = _refine(problem, camera, board, fixed=fixed, robust=True)
+  camera, board, _ = refine(problem, camera, board, fixed=fixed, robust=True)
   for _ in range(5):
     error = problem.error_of_views(camera, board)
     limit = max(OUTLIER_MRAD * px_per_mrad, OUTLIER_FACTOR * float(np.median(error)))
@@ -195,7 +160,7 @@ def _without_outliers(
     if len(kept) - kept.sum() > MOST_OUTLIERS * len(kept):
       break
     good = problem.select(np.flatnonzero(kept))
-    camera, board, _ = _refine(good, camera, board, fixed=fixed)
+    camera, board, _ = refine(good, camera, board, fixed=fixed)
     if (kept == before).all():
       break
   median = float(np.median(problem.error_of_views(camera, board)))
@@ -208,46 +173,10 @@ def _without_outliers(
   return camera, board, kept
 
 
-def _refine(
-  problem: Problem,
-  camera: np.ndarray,
-  board: np.ndarray,
-  *,
-  fixed: bool = False,
-  scaled: bool = False,
-  robust: bool = False,
-) -> tuple[np.ndarray, np.ndarray, Any]:
-  """Minimizes the squared errors in pixels; ``fixed`` keeps the board.
-
-  Returns:
-    Both poses and scipy's result, whose x are small changes of the poses (m, rad), then
-    the relative change of the board's size if ``scaled``.
-  """
-
-  def moved(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    return (
-      camera @ _small(x[:6]),
-      board if fixed else board @ _small(x[6:12]),
-      1.0 + x[-1] if scaled else 1.0,
-    )
-
-  def errors(x: np.ndarray) -> np.ndarray:
-    return np.concatenate(problem.errors(*moved(x))).ravel()
-
-  found = least_squares(
-    errors,
-    np.zeros((6 if fixed else 12) + scaled),
-    loss="soft_l1" if robust else "linear",
-    x_scale="jac",
-  )
-  camera, board, _ = moved(found.x)
-  return camera, board, found
-
-
 def _check_scale(problem: Problem, camera: np.ndarray, board: np.ndarray) -> None:
   """Checks the size of the board against the motion of the arm."""
-  _, _, found = _refine(problem, camera, board, scaled=True)
-  scale, deviation = 1.0 + found.x[-1], _deviations(found)[-1]
+  _, _, found = refine(problem, camera, board, scaled=True)
+  scale, deviation = 1.0 + found.x[-1], deviations(found)[-1]
   if abs(scale - 1.0) > max(LARGEST_SCALE_ERROR, 3 * deviation):
     raise ConfigError(
       f"by the motion of the arm, the board's squares measure "
@@ -260,12 +189,12 @@ def _residuals(
   problem: Problem, poses: np.ndarray, camera: np.ndarray, board: np.ndarray
 ) -> dict[str, Any]:
   """Returns errors on all views, on views that were held out, and uncertainties."""
-  _, _, found = _refine(problem, camera, board)
-  deviation = _deviations(found)
+  _, _, found = refine(problem, camera, board)
+  deviation = deviations(found)
   rows, held_out = np.arange(len(poses)), []
   for fold in range(_FOLDS):
     test = rows % _FOLDS == fold
-    cameras = _refine(problem.select(rows[~test]), camera, board)[:2]
+    cameras = refine(problem.select(rows[~test]), camera, board)[:2]
     held_out.append(_consistency(problem.select(rows[test]), poses[test], *cameras))
   return _consistency(problem, poses, camera, board) | {
     "held_out": {
@@ -277,13 +206,6 @@ def _residuals(
   }
 
 
-def _deviations(found: Any) -> np.ndarray:
-  """Returns the standard deviations of the unknowns that scipy solved for."""
-  freedom = max(1, len(found.fun) - len(found.x))
-  covariance = np.linalg.pinv(found.jac.T @ found.jac) * 2 * found.cost / freedom
-  return np.sqrt(np.diag(covariance))
-
-
 def _consistency(
   problem: Problem, poses: np.ndarray, camera: np.ndarray, board: np.ndarray
 ) -> dict[str, Any]:
@@ -292,28 +214,10 @@ def _consistency(
   shift = np.linalg.norm(expected[:, :3, 3] - poses[:, :3, 3], axis=1)
   turn = [angle_deg(a, b) for a, b in zip(expected, poses, strict=True)]
   return {
-    "px": _rms(np.concatenate(problem.errors(camera, board))),
+    "px": rms(np.concatenate(problem.errors(camera, board))),
     "mm": 1e3 * float(np.sqrt(np.mean(shift**2))),
     "deg": float(np.sqrt(np.mean(np.square(turn)))),
   }
-
-
-def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
-  """Returns the angle between the rotations of two poses in degrees."""
-  turn = Rotation.from_matrix(a[:3, :3].T @ b[:3, :3])
-  return float(np.degrees(turn.magnitude()))
-
-
-def _rms(errors: np.ndarray) -> float:
-  """Returns the root mean square length of errors f64[n, 2]."""
-  return float(np.sqrt((errors**2).sum(-1).mean()))
-
-
-def _small(x: np.ndarray) -> np.ndarray:
-  """Returns the pose of a shift (m) and a rotation vector (rad), f64[6]."""
-  pose = np.eye(4)
-  pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec(x[3:]).as_matrix(), x[:3]
-  return pose
 
 
 def _mean_pose(poses: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from apnpql_jax.console import print_line
-from apnpql_jax.errors import ConfigError, DeviceError, FileError, one_line
+from apnpql_jax.errors import ConfigError, FileError, one_line
 from apnpql_jax.robot.calibration import boards
 from apnpql_jax.robot.calibration.boards import Board
 from apnpql_jax.robot.calibration.lenses import Lens
@@ -26,6 +26,7 @@ Json = dict[str, Any]
 
 CAMERA = "camera.json"
 _STILL = 0.005  # rad/s; slower joints are at rest
+_SAME = 5e-4  # rad; nearer joint angles are the same
 _SETTLE_S = 0.3  # at rest, before the image is taken
 _PATIENCE_S = 5.0
 
@@ -128,7 +129,7 @@ def record(
 
   Raises:
     ConfigError: The camera is simulated.
-    DeviceError: A device fails, or the arm does not come to rest.
+    DeviceError: A device fails.
     FileError: The folder exists, or cannot be written.
   """
   from PIL import Image
@@ -140,10 +141,16 @@ def record(
   about = {"serial": str(camera.describe()["serial_number"]), "lens": camera.lens()}
   count = 0
   while True:
-    answer = ask(f"{folder.name} {count + 1}: move the arm; Enter, or d when done: ")
-    if answer.strip().lower() == "d":
+    try:
+      text = f"{folder.name} {count + 1}: move the arm; Enter, or d when done: "
+      if ask(text).strip().lower() == "d":
+        return
+    except EOFError:  # Nobody can answer.
       return
-    joints, image = _at_rest(arm, camera)
+    if (taken := _at_rest(arm, camera)) is None:
+      print_line("arm or image did not come to rest; hold the arm still")
+      continue
+    joints, image = taken
     seen = boards.detect(board, image)
     if seen is None:
       print_line("the board is not in view; try another posture")
@@ -159,21 +166,19 @@ def record(
     print_line(f"view {count}: {len(seen.ids)} of {len(board.corners)} corners")
 
 
-def _at_rest(arm: Arm, camera: NativeCamera) -> tuple[np.ndarray, np.ndarray]:
-  """Returns joint angles and an image that were taken while the arm stood still."""
+def _at_rest(arm: Arm, camera: NativeCamera) -> tuple[np.ndarray, np.ndarray] | None:
+  """Returns joint angles and an image of one instant of rest, or None without one."""
   began = since = time.monotonic()
   start = arm.get_observation().position
   while time.monotonic() < began + _PATIENCE_S:
     state, frame = arm.get_observation(), camera.get_native()
-    moved = np.abs(state.position - start).max() > 0.1 * _STILL
+    moved = np.abs(state.position - start).max() > _SAME
     if moved or np.abs(state.velocity).max() > _STILL:
       since, start = time.monotonic(), state.position
     elif frame.time > since + _SETTLE_S and state.time > since + _SETTLE_S:
       return state.position, frame.image
     time.sleep(0.02)
-  raise DeviceError(
-    f"arm or image did not come to rest within {_PATIENCE_S:.0f} s: hold the arm still"
-  )
+  return None
 
 
 def _image(path: Path) -> np.ndarray:

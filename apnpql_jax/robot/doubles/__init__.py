@@ -23,7 +23,7 @@ from apnpql_jax.robot.drivers.ur5e import UR5e
 PAYLOAD_KG = 0.488
 """Gripper and camera in the scenes."""
 
-PAYLOAD_COG_M = (0.0, 0.0, 0.05)
+PAYLOAD_COG_M = (-0.006, 0.0, 0.048)
 _COUNT = itertools.count()
 
 

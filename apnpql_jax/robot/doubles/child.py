@@ -40,6 +40,7 @@ class Child:
       pass_fds=[theirs.fileno()],
       env={**os.environ, "PYTHONPATH": path},
       stdin=subprocess.DEVNULL,
+      start_new_session=True,  # Ctrl-C is for the program that has to stop the arm.
     )
     theirs.close()
     try:
@@ -88,3 +89,4 @@ def run(module: str, descriptor: int) -> None:
       pipe.send(error)
     except Exception as error:
       pipe.send(ConfigError(f"a double does not start: {one_line(error)}"))
+      raise

@@ -20,7 +20,6 @@ _HEADER = b"\xff\xff\xfd\x00"
 _PING, _READ, _WRITE, _STATUS = 1, 2, 3, 0x55
 _CRC_ERROR, _LIMIT_ERROR, _ACCESS_ERROR, _INSTRUCTION_ERROR = 3, 6, 7, 2
 _ALERT = 0x80
-_EEPROM = 512  # addresses below are read-only while the torque is on
 _REVOLUTION = 2 * math.pi / 60
 _DEFAULTS = {  # EEPROM as delivered: e-Manual
   "RH-P12-RN": {"current_limit": 820, "velocity_limit": 100, "acceleration_limit": 255},
@@ -78,7 +77,8 @@ class Gripper:
 
   def store(self, address: int, data: bytes) -> int:
     """Writes registers; returns the error of the status packet."""
-    if address < _EEPROM and self._get(self.table.torque_enable):
+    enable = self.table.torque_enable  # The first address of the RAM.
+    if address < enable.address and self._get(enable):
       return _ACCESS_ERROR
     before = bytes(self._memory)
     self._memory[address : address + len(data)] = data

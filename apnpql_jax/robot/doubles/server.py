@@ -70,8 +70,9 @@ class Server:
     self._open(port, accept)
 
   def forget(self, source: Any) -> None:
-    """Stops watching and closes a source."""
-    self._selector.unregister(source)
+    """Stops watching and closes a source, if that has not happened yet."""
+    with contextlib.suppress(KeyError, ValueError):
+      self._selector.unregister(source)
     source.close()
 
   def drop(self) -> None:
@@ -116,7 +117,7 @@ class Server:
     def read() -> None:
       text = self._receive(client)
       if text is None:
-        self._scripts.pop(client)
+        self._scripts.pop(client, None)
         return
       self._scripts[client] += text
       if self._scripts[client].rstrip().endswith(b"\nend"):

@@ -77,8 +77,12 @@ class RealSense:
       sensor, profile = self._choose(device)
       lens = self._lens or self._maker_lens(profile)
       self._prepare = images.Preparation(lens, self._view)
-      if sensor.supports(rs.option.global_time_enabled):
-        sensor.set_option(rs.option.global_time_enabled, 1)
+      for option, value in (
+        (rs.option.global_time_enabled, 1),
+        (rs.option.auto_exposure_priority, 0),  # Else frames get rarer in the dark.
+      ):
+        if sensor.supports(option):
+          sensor.set_option(option, value)
       self._queue = rs.frame_queue(1)
       sensor.open(profile)
       self._sensor, self._lens = sensor, lens

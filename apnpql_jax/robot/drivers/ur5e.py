@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import contextlib
+import ctypes
 import threading
 import time
 from typing import Any, TypeVar
@@ -20,34 +21,14 @@ import numpy as np
 from apnpql_jax.errors import DeviceError, one_line
 from apnpql_jax.robot.drivers import vendor
 from apnpql_jax.robot.drivers.ur_check import check_controller
+from apnpql_jax.robot.drivers.ur_state import CYCLE, VARIABLES, Reports
 from apnpql_jax.robot.protocols import ArmState
 
-CYCLE = 0.002  # s
 LOOKAHEAD = 0.03  # s, the least that servoJ takes
 GAIN = 300.0  # of servoJ, in 100..2000
 BRAKING = 4.0  # m/s^2 of the tool
 
-_SILENCE = 0.2  # s without data after which the connection counts as lost
-_AT_REST = 0.01  # rad/s
 _PATIENCE = 5.0  # s for the controller to carry out a command
-_VARIABLES = [
-  *("timestamp", "actual_q", "actual_qd", "actual_TCP_force", "robot_mode"),
-  *("safety_status_bits", "robot_status_bits", "target_speed_fraction"),
-]
-_PROGRAM_RUNS = 1 << 1  # of robot_status_bits
-_POWERED = 7  # robot_mode RUNNING
-_STOPS = {
-  1 << 2: "protective stop: clear the collision and unlock it on the teach pendant",
-  1 << 3: "recovery mode: move the arm within its limits on the teach pendant",
-  1 << 4: "safeguard stop: close the safeguard and reset it",
-  1 << 5: "emergency stop of the system: release it and power the arm on",
-  1 << 6: "emergency stop of the robot: release it and power the arm on",
-  1 << 7: "emergency stop: release it and power the arm on",
-  1 << 8: "safety violation: restart the safety system on the teach pendant",
-  1 << 9: "safety fault: restart the controller",
-  1 << 10: "stopped for safety: see the teach pendant",
-}
-"""Bits of safety_status_bits (RTDE guide of Universal Robots)."""
 
 _T = TypeVar("_T")
 
@@ -77,48 +58,49 @@ class UR5e:
     self._payload = float(payload_kg), [float(x) for x in payload_cog_m]
     self._servo = CYCLE, float(lookahead_s), float(gain)
     self._receive: Any = None
+    self._reports: Reports | None = None
     self._control: Any = None
     self._about: dict[str, Any] = {}
     self._following = False
-    self._clock = _Clock()
 
   def connect(self) -> None:
-    """See ``protocols.Device``.
+    """See ``protocols.Device``; harmless if it is connected.
 
     Raises:
       DeviceError: Nothing answers, it is not a UR5e, it is not in remote control, or
         it is not ready to move.
     """
+    if self._reports:
+      return
     receive = vendor("rtde_receive", "ur_rtde")
     control = vendor("rtde_control", "ur_rtde")
     dashboard = vendor("dashboard_client", "ur_rtde")
     self._about = check_controller(self._host, dashboard)
     try:
       self._receive = self._within(
-        receive.RTDEReceiveInterface, self._host, 1 / CYCLE, _VARIABLES
+        receive.RTDEReceiveInterface, self._host, 1 / CYCLE, VARIABLES
       )
       self._control = self._within(control.RTDEControlInterface, self._host, 1 / CYCLE)
+      # Its destructor ends the process if the connection is lost: it never runs.
+      ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._control))
+      self._reports = Reports(self._host, self._receive)
+      self._reports.check()
     except DeviceError:
       self.disconnect()
       raise
-    self._clock = _Clock()
-    if fault := self.get_observation().fault:
-      self.disconnect()
-      raise DeviceError(f"{self._host}: {fault}")
 
   def disconnect(self) -> None:
     """See ``protocols.Device``."""
     receive, control = self._receive, self._control
-    if control and receive and not self._fault():
-      with contextlib.suppress(DeviceError):
-        self.stop()
-    self._receive = self._control = None
-    for call in (
-      *((control.stopScript, control.disconnect) if control else ()),
-      *((receive.disconnect,) if receive else ()),
-    ):
+    calls = [receive.disconnect] if receive else []
+    if control:
+      calls.insert(0, control.disconnect)
+      if receive.isConnected():  # Else it would try to reconnect.
+        calls = [self.stop, control.stopScript, *calls]
+    for call in calls:
       with contextlib.suppress(DeviceError):
         self._within(call)
+    self._receive = self._reports = self._control = None
 
   def describe(self) -> dict[str, Any]:
     """See ``protocols.Device``."""
@@ -134,17 +116,7 @@ class UR5e:
 
   def get_observation(self) -> ArmState:
     """See ``protocols.Arm``; a lost connection is a fault, too."""
-    source = self._connected()
-    for _ in range(3):  # A package may arrive between two calls.
-      stamp = source.getTimestamp()
-      position, velocity = source.getActualQ(), source.getActualQd()
-      wrench = source.getActualTCPForce()
-      if source.getTimestamp() == stamp:
-        break
-    time_ = self._clock.local(stamp)
-    return ArmState(
-      time_, np.array(position), np.array(velocity), np.array(wrench), self._fault()
-    )
+    return self._open().measure(following=self._following)
 
   def send_action(self, position: np.ndarray) -> None:
     """See ``protocols.Arm``.
@@ -154,23 +126,30 @@ class UR5e:
     """
     if not self._following:
       raise DeviceError(f"{self._host}: the arm follows commands only after start")
-    if fault := self._fault():  # servoJ would reconnect, however long that takes.
+    # In servoJ, ur_rtde would reconnect, however long that takes.
+    if fault := self._fault():
       raise DeviceError(f"{self._host}: {fault}")
-    joints = [float(x) for x in position]
-    if not self._control.servoJ(joints, 0.0, 0.0, *self._servo):
+    joints = np.asarray(position, float)
+    if joints.shape != (6,) or not np.isfinite(joints).all():
+      raise DeviceError(f"{self._host}: {joints.tolist()} are not 6 joint angles")
+    try:
+      followed = self._control.servoJ(joints.tolist(), 0.0, 0.0, *self._servo)
+    except Exception as error:  # ur_rtde raises several kinds.
+      raise DeviceError(f"{self._host}: {one_line(error)}") from None
+    if not followed:
       fault = self._fault() or "the controller refuses joint targets"
       raise DeviceError(f"{self._host}: {fault}")
 
   def stop(self) -> None:
     """See ``protocols.Arm``; waits until the arm is at rest."""
-    try:
-      if not self._following or self._fault():
-        return  # The controller itself stops the arm.
-      if not self._within(self._control.servoStop, BRAKING) and not self._fault():
+    moves = self._following and not self._fault()
+    if moves and not self._within(self._control.servoStop, BRAKING):
+      moves = False
+      if not self._fault():
         raise DeviceError(f"{self._host}: the controller does not end servoJ")
-    finally:
-      self._following = False
-    self._wait_for_rest()
+    self._following = False  # A fault stops the arm by itself.
+    if moves:
+      self._open().wait_for_rest()
 
   def start(self) -> None:
     """See ``protocols.Arm``; sets the payload first.
@@ -178,40 +157,27 @@ class UR5e:
     Raises:
       DeviceError: The arm moves, or the controller does not carry out a command.
     """
-    if fault := self._fault():
-      raise DeviceError(f"{self._host}: {fault}")
-    source, control = self._connected(), self._control
-    if (share := source.getTargetSpeedFraction()) < 1:
+    reports, control = self._open(), self._control
+    reports.check()
+    if (share := reports.speed_slider) < 1:
       raise DeviceError(
         f"{self._host}: the speed slider is at {share:.0%}: set it to 100%"
       )
-    if not source.getRobotStatus() & _PROGRAM_RUNS:
+    if not reports.program_runs:
       self._restart()
-    self._wait_for_rest()
+    reports.wait_for_rest()
     self._command("payload", control.setPayload, *self._payload)
     self._command("zero of the force sensor", control.zeroFtSensor)
+    reports.wait_for_news()  # Older measurements have the old zero.
     self._following = True
 
-  def _connected(self) -> Any:
-    if self._receive is None:
+  def _open(self) -> Reports:
+    if self._reports is None:
       raise DeviceError(f"{self._host}: the arm is not connected")
-    return self._receive
+    return self._reports
 
   def _fault(self) -> str:
-    """Returns why the arm does not follow commands."""
-    source = self._connected()
-    silence = self._clock.silence(source.getTimestamp())
-    if not source.isConnected() or silence > _SILENCE:
-      return "lost the connection to the controller: check network and power"
-    runs = source.getRobotStatus() & _PROGRAM_RUNS
-    bits = source.getSafetyStatusBits()  # Read last, as it names the cause.
-    if stops := [text for bit, text in _STOPS.items() if bits & bit]:
-      return stops[0]
-    if source.getRobotMode() != _POWERED:
-      return "the arm is not powered: power it on and release the brakes"
-    if self._following and not runs:
-      return "the program on the controller stopped: check remote control, then start"
-    return ""
+    return self._open().fault(following=self._following)
 
   def _restart(self) -> None:
     """Sends the program again, which would obey the last command of the registers."""
@@ -221,15 +187,6 @@ class UR5e:
     while not self._control.isProgramRunning():
       if time.monotonic() > end:
         raise DeviceError(f"{self._host}: the program on the controller does not start")
-      time.sleep(CYCLE)
-
-  def _wait_for_rest(self) -> None:
-    end = time.monotonic() + _PATIENCE
-    while np.abs(self._connected().getActualQd()).max() > _AT_REST:
-      if fault := self._fault():
-        raise DeviceError(f"{self._host}: {fault}")
-      if time.monotonic() > end:
-        raise DeviceError(f"{self._host}: the arm does not come to rest")
       time.sleep(CYCLE)
 
   def _command(self, name: str, call: Callable[..., bool], *args: Any) -> None:
@@ -259,31 +216,3 @@ class UR5e:
       return results[0]
     reason = one_line(errors[0]) if errors else f"no answer within {_PATIENCE:g} s"
     raise DeviceError(f"{self._host}: {reason}")
-
-
-class _Clock:
-  """The controller's clock in terms of ``time.monotonic``.
-
-  A package cannot arrive before it was sent, so the least difference of both clocks
-  holds, but for their drift.
-  """
-
-  _DRIFT = 1e-4  # s per s, more than that of quartz clocks
-
-  def __init__(self) -> None:
-    self._offset = np.inf
-    self._last, self._arrival = -1.0, time.monotonic()
-
-  def local(self, stamp: float) -> float:
-    """Returns the local time of a stamp of the controller, s."""
-    self.silence(stamp)
-    return stamp + self._offset
-
-  def silence(self, stamp: float) -> float:
-    """Returns how long this is the newest stamp, s."""
-    now = time.monotonic()
-    if stamp != self._last:
-      drift = self._DRIFT * (now - self._arrival)
-      self._offset = min(self._offset + drift, now - stamp)
-      self._last, self._arrival = stamp, now
-    return now - self._arrival

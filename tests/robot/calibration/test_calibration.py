@@ -29,6 +29,7 @@ from apnpql_jax.robot import devices
 from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.calibration import command, files, limits, solve, views
 from apnpql_jax.robot.calibration.boards import Board
+from apnpql_jax.robot.calibration.problem import Problem, angle_deg
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.protocols import ArmState, Frame
 from apnpql_jax.sim.scene import load_scene
@@ -97,10 +98,10 @@ def both(tmp_path, wrist, held) -> Path:
 
 def assert_close(found: np.ndarray, truth: np.ndarray) -> None:
   assert 1e3 * np.linalg.norm(found[:3, 3] - truth[:3, 3]) < MOST_MM
-  assert solve.angle_deg(found, truth) < MOST_DEG
+  assert angle_deg(found, truth) < MOST_DEG
 
 
-def problem(case: Case, *, on_tool: bool) -> solve.Problem:
+def problem(case: Case, *, on_tool: bool) -> Problem:
   shown = views.load(case.folder)
   seen = views.seen_in(BOARD, shown)
   motion = np.tile(np.eye(4), (len(seen), 1, 1))
@@ -109,7 +110,7 @@ def problem(case: Case, *, on_tool: bool) -> solve.Problem:
   if not on_tool:
     motion = np.linalg.inv(motion)
   assert shown.lens is not None
-  return solve.Problem(BOARD, shown.lens, [*seen.values()], motion)
+  return Problem(BOARD, shown.lens, [*seen.values()], motion)
 
 
 def test_both_cameras_are_found(contract, both, wrist, held, tmp_path):
@@ -447,6 +448,10 @@ def test_the_command_prints_a_board(tmp_path, capfd):
   assert "'3' is no board; write it as 7x5:36:27" in capfd.readouterr().err
 
 
+SWINGING = 4
+"""Number of the posture at which the arm does not come to rest."""
+
+
 class Hand:
   """An arm that is moved by hand through postures, and trembles before each."""
 
@@ -461,7 +466,8 @@ class Hand:
     return "d" if self.at == len(self.joints) else ""
 
   def get_observation(self) -> ArmState:
-    moving = self.now < self.moved + 0.2
+    # It trembles at first, and swings all the time at one posture.
+    moving = self.now < self.moved + 0.2 or self.at == SWINGING
     speed = 0.1 if moving else 0.0
     joints = self.joints[min(self.at, len(self.joints) - 1)] + 0.1 * speed
     self.camera.showing = None if moving else self.at
@@ -490,11 +496,13 @@ class Sensor:
 def test_views_are_taken_with_connected_devices(
   contract, wrist, tmp_path, monkeypatch, capfd
 ):
-  """Only when arm and image are at rest; a view without the board is not kept."""
+  """Only at rest; a view without the board is not kept, nor one of a moving arm."""
   shown = views.load(wrist.folder)
   assert shown.lens is not None
-  images = [*shown.images[:2], np.zeros_like(shown.images[0]), *shown.images[2:]]
-  joints = np.insert(shown.joints, 2, shown.joints[1], axis=0)
+  more = [2, SWINGING - 1]  # One without the board, one that is not held still.
+  joints = np.insert(shown.joints, more, shown.joints[0], axis=0)
+  images = [*shown.images[:2], np.zeros_like(shown.images[0]), shown.images[2]]
+  images += [shown.images[0], *shown.images[3:]]
   sensor = Sensor(images, shown.lens.to_json())
   arm = Hand(joints, sensor)
   sensor.clock = arm
@@ -513,7 +521,8 @@ def test_views_are_taken_with_connected_devices(
     cameras={"wrist": sensor},  # ty: ignore[invalid-argument-type]
     ask=arm.move,
   )
-  assert "not in view" in capfd.readouterr().err
+  told = capfd.readouterr().err
+  assert told.count("not in view") == 1 and told.count("not come to rest") == 1
   taken = views.load(tmp_path / "live" / "wrist")
   np.testing.assert_array_equal(taken.joints, shown.joints)
   made = files.read(out).cameras["wrist"]
@@ -521,5 +530,11 @@ def test_views_are_taken_with_connected_devices(
   assert_close(made.pose, wrist.truth)
   with pytest.raises(FileError, match="exists; name another folder for new views"):
     views.record(tmp_path / "live" / "wrist", BOARD, arm, sensor, ask=arm.move)  # ty: ignore[invalid-argument-type]
+
+  def nobody(text: str) -> str:
+    raise EOFError
+
+  views.record(tmp_path / "none" / "wrist", BOARD, arm, sensor, ask=nobody)  # ty: ignore[invalid-argument-type]
+  assert not (tmp_path / "none").exists()
   with pytest.raises(ConfigError, match="wrist camera gives no images of its sensor"):
     views.record(tmp_path / "new" / "wrist", BOARD, arm, arm, ask=arm.move)  # ty: ignore[invalid-argument-type]

@@ -11,7 +11,7 @@ pytest.importorskip("rtde_receive", reason="needs ur_rtde")
 
 from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot import doubles
-from apnpql_jax.robot.calibration import command
+from apnpql_jax.robot.calibration import live
 from apnpql_jax.robot.drivers.ur_listener import Listener
 
 
@@ -51,7 +51,7 @@ def test_a_missing_device_is_one_line(rig, tmp_path):
   serials = {"global": "1", "wrist": "2"}
 
   def calibrate(host: str) -> None:
-    command.calibrate_cell(
+    live.calibrate_cell(
       contract, views, out, host=host, serials=serials, recorded=False
     )
 

@@ -93,6 +93,38 @@ def test_the_processes_end_with_their_parent():
     ask(host, "state")
 
 
+def test_ctrl_c_does_not_end_them():
+  code = """
+import os, signal, time
+from apnpql_jax.robot import doubles
+from apnpql_jax.robot.doubles.server import ask
+server = doubles.serve("push_plate")
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+os.killpg(0, signal.SIGINT)
+time.sleep(0.5)
+ask(server.greeting[0], "state")
+server.close()
+"""
+  subprocess.run(
+    [sys.executable, "-c", code], check=True, start_new_session=True, timeout=60
+  )
+
+
+def test_payload_of_the_rig_is_that_of_the_scene():
+  plant = Plant("push_plate", noise=False)
+  tool = plant.model.body("gripper").id
+  assert plant.model.body_subtreemass[tool] == pytest.approx(doubles.PAYLOAD_KG)
+  plant.zero_wrench()
+  plant.set_payload(doubles.PAYLOAD_KG, np.array(doubles.PAYLOAD_COG_M))
+  plant.step()
+  plant.zero_wrench()
+  plant.servo(plant.position + [0, 0, 0, 0, 1.0, 0], 0.03, 300)
+  for _ in range(1000):
+    plant.step()
+  assert np.abs(plant.wrench[:3]).max() < 0.01  # N
+  assert np.abs(plant.wrench[3:]).max() < 0.05  # N m; the fingers move their center
+
+
 def test_drivers_and_doubles_import_no_jax():
   code = (
     "import sys; from apnpql_jax.robot import doubles; "
@@ -127,6 +159,26 @@ def test_the_fingers_lift_an_object():
   held = data.qpos[address : address + 3] - tool.xpos
   assert np.linalg.norm(held) < 0.03 + np.linalg.norm(place)
   assert plant.wrench[2] == pytest.approx(-9.81 * mass, abs=1.0)
+
+
+def test_the_plant_follows_with_the_lag_of_servo_j():
+  plant = Plant("push_plate", noise=False)
+  start, swing = plant.position, np.array([0.3, 0.1, -0.1, 0.2, -0.2, 0.3])
+  times = np.arange(0, 3, STEP)
+  targets = start + swing * np.sin(times[:, None]) ** 2
+  for lookahead, gain, lag in ((0.03, 300, 0.03), (0.1, 300, 0.1), (0.03, 150, 0.06)):
+    real = []
+    for target in targets:
+      plant.servo(target, lookahead, gain)
+      assert not plant.step()
+      real.append(plant.position)
+    delays = np.arange(0.0, 0.2, STEP)
+    for joint in range(6):
+      late = [np.interp(times - d, times, targets[:, joint]) for d in delays]
+      errors = [np.abs(x - np.array(real)[:, joint])[500:].mean() for x in late]
+      best = delays[int(np.argmin(errors))]
+      assert best == pytest.approx(lag, abs=3 * STEP)
+      assert min(errors) < 0.01 * abs(swing[joint])
 
 
 def test_other_bytes_than_rtde_are_refused():

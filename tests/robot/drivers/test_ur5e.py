@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator
 import contextlib
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -14,7 +15,8 @@ import pytest
 
 from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot import doubles
-from apnpql_jax.robot.drivers.ur5e import CYCLE, LOOKAHEAD, UR5e
+from apnpql_jax.robot.drivers.ur5e import UR5e
+from apnpql_jax.robot.drivers.ur_state import CYCLE
 
 pytest.importorskip("rtde_control", reason="needs ur_rtde")
 
@@ -56,37 +58,39 @@ def test_the_state_is_that_of_the_plant(rig):
   assert 0 <= time.monotonic() - state.time < 0.1
 
 
-def test_the_arm_follows_its_targets_with_the_lag_of_servo_j(rig):
+def test_the_arm_follows_its_targets(rig):
   start = rig.arm.get_observation().position
   swing = np.array([0.2, 0.1, -0.1, 0.2, -0.2, 0.3])
-  log = servo(rig.arm, lambda t: start + swing * np.sin(1.5 * t) ** 2, 2.0)
-  target, real = (np.stack([x(row) for row in log]) for x in (_command, _position))
-  assert np.ptp(real, 0) == pytest.approx(np.abs(swing), rel=0.05)
-  times = np.array([row[0] for row in log])
-  # The best delay of the targets, joint by joint; transport adds a few cycles.
-  delays = np.arange(0.0, 0.2, 0.002)
-  for joint in range(6):
-    errors = [
-      np.abs(np.interp(times - d, times, target[:, joint]) - real[:, joint]).mean()
-      for d in delays
-    ]
-    assert LOOKAHEAD <= delays[int(np.argmin(errors))] < LOOKAHEAD + 0.03
-    assert min(errors) < 0.01 * abs(swing[joint])
+  path = lambda t: start + swing * np.sin(min(t, 1) * np.pi / 2) ** 2  # noqa: E731
+  log = servo(rig.arm, path, 2.0)
+  real = np.stack([state.position for _, _, state in log])
+  np.testing.assert_allclose(real[-1], start + swing, atol=1e-3)
+  along = (real - start) @ swing / (swing @ swing)  # The share of the way.
+  assert (np.diff(along) > -1e-3).all() and along.max() < 1.001
+  stamps = np.array([state.time for _, _, state in log])
+  assert (np.diff(stamps) >= 0).all() and len(set(stamps)) > 100
 
 
 def test_it_brakes_to_rest_and_starts_again(rig):
   start = rig.arm.get_observation().position
   speed = np.array([0.5, 0, 0, 0, 0, 0])
   log = servo(rig.arm, lambda t: start + speed * t, 0.6)
-  assert log[-1][2].velocity[0] == pytest.approx(0.5, abs=0.1)
+  assert log[-1][2].velocity[0] > 0.1
   rig.arm.stop()
   rest = rig.arm.get_observation()
   assert np.abs(rest.velocity).max() < 0.02
   with pytest.raises(DeviceError, match="only after start"):
     rig.arm.send_action(rest.position)
   rig.arm.start()
-  servo(rig.arm, lambda _: start, 0.5)
+  servo(rig.arm, lambda _: start, 1.0)
   np.testing.assert_allclose(rig.state()["position"], start, atol=1e-3)
+
+
+@pytest.mark.parametrize("joints", [np.zeros(7), np.full(6, np.nan)])
+def test_what_is_not_six_angles_is_refused(rig, joints):
+  with pytest.raises(DeviceError, match="are not 6 joint angles"):
+    rig.arm.send_action(joints)
+  assert not rig.arm.get_observation().fault
 
 
 def test_start_takes_bias_and_payload_off_the_wrench():
@@ -134,6 +138,25 @@ def test_each_fault_is_one_line_in_time(rig, cause, text):
   rig.arm.stop()  # Harmless.
 
 
+def test_a_lost_connection_does_not_end_the_process():
+  code = """
+import gc, time
+from apnpql_jax.robot import doubles
+with doubles.start("push_plate") as rig:
+  rig.arm.start()
+  rig.drop_rtde()
+  time.sleep(0.5)
+  rig.arm.disconnect()
+  rig.arm = None
+  gc.collect()
+print("alive")
+"""
+  done = subprocess.run(
+    [sys.executable, "-c", code], capture_output=True, text=True, timeout=60
+  )
+  assert (done.returncode, done.stdout.splitlines()[-1]) == (0, "alive")
+
+
 def test_it_starts_again_after_the_program_stopped(rig):
   start = rig.arm.get_observation().position
   servo(rig.arm, lambda t: start + [0.5 * t, 0, 0, 0, 0, 0], 0.5)
@@ -141,7 +164,7 @@ def test_it_starts_again_after_the_program_stopped(rig):
   wait_for_fault(rig.arm)
   rig.arm.stop()
   time.sleep(0.3)
-  rest = rig.state()["position"]
+  rest = np.array(rig.state()["position"])
   rig.arm.start()
   time.sleep(0.3)  # A program that obeys the old target would move the arm.
   np.testing.assert_allclose(rig.state()["position"], rest, atol=1e-4)
@@ -240,11 +263,3 @@ def test_a_missing_package_is_one_line(monkeypatch):
   arm = UR5e("127.0.7.8", payload_kg=0.5, payload_cog_m=[0, 0, 0.05])
   with pytest.raises(DeviceError, match=r"robot needs ur_rtde: pip install"):
     arm.connect()
-
-
-def _command(row: tuple) -> np.ndarray:
-  return row[1]
-
-
-def _position(row: tuple) -> np.ndarray:
-  return row[2].position
