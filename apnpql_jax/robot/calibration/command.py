@@ -27,8 +27,7 @@ from apnpql_jax.robot.calibration.boards import Board
 from apnpql_jax.robot.calibration.files import CalibratedCamera, Calibration
 from apnpql_jax.robot.calibration.problem import Problem
 from apnpql_jax.robot.calibration.solve import Solution
-from apnpql_jax.robot.calibration.views import NativeCamera, Views
-from apnpql_jax.robot.protocols import Arm
+from apnpql_jax.robot.calibration.views import MeasuredArm, NativeCamera, Views
 
 Json = dict[str, Any]
 
@@ -54,7 +53,7 @@ def calibrate(
   *,
   board: str = Board().text,
   board_on: str = "tool",
-  arm: Arm | None = None,
+  arm: MeasuredArm | None = None,
   cameras: Mapping[str, NativeCamera] | None = None,
   serials: Mapping[str, str] | None = None,
   ask: Callable[[str], str] = input,

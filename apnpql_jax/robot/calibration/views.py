@@ -20,7 +20,7 @@ from apnpql_jax.errors import ConfigError, FileError, one_line
 from apnpql_jax.robot.calibration import boards
 from apnpql_jax.robot.calibration.boards import Board
 from apnpql_jax.robot.calibration.lenses import Lens
-from apnpql_jax.robot.protocols import Arm, Device, Frame
+from apnpql_jax.robot.protocols import ArmState, Device, Frame
 
 Json = dict[str, Any]
 
@@ -29,6 +29,14 @@ _STILL = 0.005  # rad/s; slower joints are at rest
 _SAME = 5e-4  # rad; nearer joint angles are the same
 _SETTLE_S = 0.3  # at rest, before the image is taken
 _PATIENCE_S = 5.0
+
+
+class MeasuredArm(Device, Protocol):
+  """An arm that is read; it need not take commands."""
+
+  def get_observation(self) -> ArmState:
+    """Returns the newest measurement without waiting."""
+    ...
 
 
 class NativeCamera(Device, Protocol):
@@ -110,7 +118,7 @@ def _camera(folder: Path) -> tuple[str, Lens | None]:
 def record(
   folder: Path,
   board: Board,
-  arm: Arm,
+  arm: MeasuredArm,
   camera: NativeCamera,
   *,
   ask: Callable[[str], str] = input,
@@ -166,7 +174,9 @@ def record(
     print_line(f"view {count}: {len(seen.ids)} of {len(board.corners)} corners")
 
 
-def _at_rest(arm: Arm, camera: NativeCamera) -> tuple[np.ndarray, np.ndarray] | None:
+def _at_rest(
+  arm: MeasuredArm, camera: NativeCamera
+) -> tuple[np.ndarray, np.ndarray] | None:
   """Returns joint angles and an image of one instant of rest, or None without one."""
   began = since = time.monotonic()
   start = arm.get_observation().position

@@ -1,18 +1,25 @@
-"""A UR5e that is only read, while the teach pendant has control."""
+"""A UR controller that is only read, while the teach pendant has control."""
 
 from __future__ import annotations
 
-from apnpql_jax.errors import DeviceError
-from apnpql_jax.robot.drivers import ur5e, vendor
+import contextlib
+from typing import Any
+
+from apnpql_jax.errors import DeviceError, one_line
+from apnpql_jax.robot.drivers import vendor
 from apnpql_jax.robot.drivers.ur_check import check_rtde
+from apnpql_jax.robot.drivers.ur_state import CYCLE, VARIABLES, Reports
+from apnpql_jax.robot.protocols import ArmState
 
 
-class Listener(ur5e.UR5e):
-  """An arm whose joint angles are read, such as in free drive; it takes no commands."""
+class Listener:
+  """An arm that is measured, such as in free drive; it takes no commands."""
 
   def __init__(self, host: str):
     """Stores the address; ``connect`` opens the connection."""
-    super().__init__(host, payload_kg=0.0, payload_cog_m=(0.0, 0.0, 0.0))
+    self._host = host
+    self._receive: Any = None
+    self._reports: Reports | None = None
 
   def connect(self) -> None:
     """See ``protocols.Device``; in local and in remote control.
@@ -20,13 +27,31 @@ class Listener(ur5e.UR5e):
     Raises:
       DeviceError: Nothing answers.
     """
-    check_rtde(self._host)
     receive = vendor("rtde_receive", "ur_rtde")
-    self._receive = self._within(
-      receive.RTDEReceiveInterface, self._host, 1 / ur5e.CYCLE, ur5e._VARIABLES
-    )
-    self._clock = ur5e._Clock()
+    check_rtde(self._host)
+    try:
+      self._receive = receive.RTDEReceiveInterface(self._host, 1 / CYCLE, VARIABLES)
+    except Exception as error:  # ur_rtde raises several kinds.
+      raise DeviceError(f"{self._host}: {one_line(error)}") from None
+    self._reports = Reports(self._host, self._receive)
 
-  def start(self) -> None:
-    """Raises ``DeviceError``."""
-    raise DeviceError(f"{self._host}: this connection only reads")
+  def disconnect(self) -> None:
+    """See ``protocols.Device``."""
+    receive, self._receive, self._reports = self._receive, None, None
+    with contextlib.suppress(Exception):  # Whatever a lost connection raises.
+      if receive:
+        receive.disconnect()
+
+  def describe(self) -> dict[str, Any]:
+    """See ``protocols.Device``."""
+    return {"host": self._host}
+
+  def get_observation(self) -> ArmState:
+    """See ``protocols.Arm``.
+
+    Raises:
+      DeviceError: The connection is lost.
+    """
+    if self._reports is None or not self._reports.connected:
+      raise DeviceError(f"{self._host}: lost the connection: check network and power")
+    return self._reports.measure(following=False)
