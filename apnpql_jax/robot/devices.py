@@ -12,7 +12,7 @@ import importlib
 import signal
 from typing import Any
 
-from apnpql_jax.errors import ConfigError, DeviceError, one_line
+from apnpql_jax.errors import ConfigError, UserError, one_line
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
 from apnpql_jax.robot.protocols import Arm, Camera, Gripper
@@ -157,7 +157,7 @@ def check_kind(kind: str) -> None:
 
 
 def reason(error: BaseException) -> str:
-  """Returns an error of a device as one line."""
-  if isinstance(error, DeviceError):
+  """Returns an error as one line; with its type unless it is for the user."""
+  if isinstance(error, UserError):
     return one_line(error)
   return f"{type(error).__name__}: {one_line(error)}"

@@ -176,6 +176,20 @@ def test_a_blocked_arm_ends_the_command_near_it():
   assert command.at_rest
 
 
+def test_a_new_episode_begins_where_the_arm_is():
+  """As after a pause in which the arm was moved by hand."""
+  world = moving()
+  world.core.supervisor.stop("enough")
+  for _ in range(250):
+    world.step()
+  world.arm = NEUTRAL + 0.3
+  world.core.start(world.now, world.state())
+  world.action = None
+  world.act(np.zeros(7))
+  for _ in range(10):
+    np.testing.assert_allclose(world.step().position, NEUTRAL + 0.3, atol=1e-9)
+
+
 def test_a_protective_stop_of_the_arm_stops():
   world = moving()
   command = world.step(fault="protective stop")

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from apnpql_jax.config.files import mjcf_path
+from apnpql_jax.robot.limits import DEVIATION
 from apnpql_jax.robot.virtual_arm import Admittance, VirtualArm
 from apnpql_jax.sim import motors
 
@@ -56,6 +57,14 @@ def test_small_forces_and_no_admittance_change_nothing():
       arm.step(np.zeros(6), NEUTRAL, np.array([0, 0, force, 0, 0, 0.4]))
     np.testing.assert_allclose(arm.position, NEUTRAL, atol=1e-6)
     assert not arm.contact
+
+
+def test_stays_near_the_real_arm():
+  arm = VirtualArm()
+  arm.reset(NEUTRAL)
+  for _ in range(500):
+    arm.step(np.ones(6), NEUTRAL)
+  np.testing.assert_allclose(arm.position, NEUTRAL + DEVIATION)
 
 
 def test_gives_way_along_the_force():
