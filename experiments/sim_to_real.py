@@ -25,4 +25,5 @@ CONFIG = dataclasses.replace(
   # Images of this size take 77 kB per slot.
   replay=dataclasses.replace(_PLACE.replay, capacity=25_600, expert_steps=12_800),
   total_steps=409_600,
+  eval_every=20_480,
 )

@@ -23,8 +23,13 @@ ROWS = {
   "sac": Row("sac", "--agent.epsilon 10 --agent.min-alpha 0.001"),
 }
 
-EVAL_EVERY = {"push_plate": 2_560, "flip_cup": 40_960}
-"""Environment steps between evaluations; 20,480 for other tasks."""
+EVAL_EVERY = {
+  "push_plate": 2_560,
+  "stack_box": 20_480,
+  "flip_cup": 40_960,
+  "place_plate": 10_240,
+}
+"""Environment steps between evaluations."""
 
 
 def options_of(task: str, row: str, seed: int) -> list[str]:
@@ -32,7 +37,7 @@ def options_of(task: str, row: str, seed: int) -> list[str]:
   algorithm, flags, _ = ROWS[row]
   options = (
     f"--agent.algorithm {algorithm} --seed {seed} --no-video --eval-episodes 128 "
-    f"--eval-every {EVAL_EVERY.get(task, 20_480)} {flags}"
+    f"--eval-every {EVAL_EVERY[task]} {flags}"
   )
   return options.split()
 
