@@ -14,7 +14,7 @@ _STACK = load_preset("stack_box")
 CONFIG = dataclasses.replace(
   _STACK,
   env=dataclasses.replace(_STACK.env, task="flip_cup"),
-  agent=dataclasses.replace(_STACK.agent, decay_updates=40_960, gripper_offset=True),
+  agent=dataclasses.replace(_STACK.agent, decay_updates=40_960),
   total_steps=327_680,
   eval_every=40_960,
   checkpoint_every=40_960,

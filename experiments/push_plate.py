@@ -15,6 +15,7 @@ CONFIG = TrainConfig(
     epsilon=1.0,
     target_samples=30,
     policy_samples=30,
+    gripper_offset=True,
     candidate_precision="bfloat16",
     min_alpha=0.01,
     epsilon_nu=-14.0,

@@ -61,7 +61,6 @@ def options_of(task: str, row: str, seed: int) -> list[str]:
     "--env.worlds 32 --env.bank-rows 2048 "
     "--eval-acting policy --agent.candidate-precision float32 --agent.decay-updates 0 "
     "--replay.allow-unsolved "  # As when the stored results were made; no effect here.
-    "--agent.gripper-offset "
     f"--replay.expert-steps {EXPERT_STEPS.get(task, 25_600)} "
     f"--total-steps {budget * STEPS} --eval-every {budget * STEPS // EVALUATIONS} "
     f"--agent.target-samples {CANDIDATES} --agent.policy-samples {CANDIDATES} {flags}"
