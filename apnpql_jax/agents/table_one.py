@@ -96,11 +96,14 @@ def algorithm_of(config: AgentConfig) -> Algorithm:
   """Returns the row that ``config`` names, with the columns that it replaces.
 
   Raises:
-    ConfigError: The row is unknown, or Retrace is combined with a policy that has no
-      density.
+    ConfigError: The row is unknown, or is combined with a column that it cannot have.
   """
   check_name("agent.algorithm", config.algorithm, tuple(ALGORITHMS))
   row = ALGORITHMS[config.algorithm]
+  if config.regularizer == "uniform" and row.regularizer_update is fit_expert:
+    raise ConfigError(
+      "ap_dagger learns nothing but its regularizer; leave agent.regularizer at row"
+    )
   if config.regularizer == "uniform":
     row = dataclasses.replace(row, regularizer=uniform, regularizer_update=no_update)
   if config.policy_evaluation != "row":

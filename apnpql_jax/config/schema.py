@@ -137,7 +137,8 @@ class AgentConfig:
   """Means of the prior: primitives (predicted) or learned (by the M-step)."""
 
   gripper_offset: bool = codec.added(False, before=True)
-  """Whether the M-step adds to the primitives' logits of closing the gripper."""
+  """Whether the M-step adds to the logits of closing the gripper that the primitives
+  predict; with learned means it always does."""
 
   diagonal_covariance: bool = False
   """Use diagonal covariances in prior and policy."""

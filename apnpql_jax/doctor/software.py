@@ -21,8 +21,12 @@ EXTRAS = {
   "cuda": "trains on NVIDIA GPUs",
   "export": "apnpql export",
   "gym": "Gymnasium environments",
+  "lerobot": "collect --format lerobot, convert from such datasets",
+  "robot": "apnpql robot with real devices or their doubles",
+  "sb3": "Stable-Baselines3",
   "sweep": "apnpql sweep --launcher slurm",
   "tb": "--sinks tensorboard",
+  "transfer": "Bullet and TinyRenderer in apnpql transfer",
   "view": "apnpql watch in a browser",
   "wandb": "--sinks wandb",
 }

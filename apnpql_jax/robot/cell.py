@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 import tomllib
 from typing import Any
@@ -170,4 +171,5 @@ def _checked(path: Path, key: str, kind: str, value: Any) -> Any:
 
 
 def _is_number(value: Any) -> bool:
-  return isinstance(value, int | float) and type(value) is not bool and value == value
+  is_number = isinstance(value, int | float) and type(value) is not bool
+  return is_number and math.isfinite(value)

@@ -57,6 +57,9 @@ def run(
         outcomes.append(session.play())
         _report(episode, episodes, outcomes[-1])
         _keep(options.log, outcomes[-1])
+        if robot.kind == "ur5e" and outcomes[-1].stopped:
+          # It may press on something, and would move home next.
+          raise DeviceError("look at the arm after a stop, then start again")
     except DeviceError as error:
       if not outcomes:
         raise

@@ -23,6 +23,8 @@ START_S = 600.0
 HOME_S = 60.0
 """Time of the session that the way to the neutral pose may take."""
 
+SOLVED, TIME_LIMIT = "solved", "time limit"
+
 _LOOK_S = 0.01  # Between two looks at the board.
 
 
@@ -64,6 +66,11 @@ class Outcome:
 
   events: list[tuple[float, str, str]]
   """Changes of the mode: time since the beginning in s, mode, reason."""
+
+  @property
+  def stopped(self) -> bool:
+    """Whether a fault ended it."""
+    return self.reason not in (SOLVED, TIME_LIMIT)
 
 
 class Session(contextlib.AbstractContextManager):
@@ -155,18 +162,23 @@ class Session(contextlib.AbstractContextManager):
     seconds = self._clock.now() - begin
     stopped = self._is_done()
     reason = self.board["state"].read()["reason"].decode() if stopped else ""
-    self._wait(
-      lambda: bool(self.board["policy"].read()["over"]), 60.0, "the policy to end"
-    )
+
+    def policy_ended() -> bool:
+      """Returns true, too, if it has not begun, as after a stop in the first cycle."""
+      policy = self.board["policy"].read()
+      return policy["order"] != number or bool(policy["over"])
+
+    self._wait(policy_ended, 60.0, "the policy to end")
     policy = self.board["policy"].read()
+    played = policy["order"] == number
     self._order(Phase.IDLE)
     self._wait(self._is_obeyed, 10.0 * self._clock.slowdown, "the arm to rest")
-    solved = bool(policy["solved"])
+    solved = bool(played and policy["solved"])
     self._take_events()
     return Outcome(
       solved=solved if self._judged else None,
-      reason=reason or ("solved" if solved else "time limit"),
-      actions=int(policy["actions"]) if policy["order"] == number else 0,
+      reason=reason or (SOLVED if solved else TIME_LIMIT),
+      actions=int(policy["actions"]) if played else 0,
       seconds=seconds,
       events=[(t - begin, mode, why) for t, mode, why in self._events],
     )

@@ -37,6 +37,9 @@ _NESTED = {
 }
 """Types of the fields of a transition, and of these, that are not arrays."""
 
+_OPTIONAL = "expert", "expert_tm1"
+"""Arrays that only some rows have."""
+
 
 def check(config: TrainConfig, state: TrainState, run_dir: Path) -> None:
   """Stops a run if its last ``max_skipped_updates`` updates were skipped.
@@ -104,7 +107,7 @@ def _below(prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, jax.Array]:
 
 
 def _example(kind: Any, path: str, names: Container[str]) -> Any:
-  """Returns a batch of placeholders, with the modalities that the file has."""
+  """Returns a batch of placeholders, with the optional parts that the file has."""
 
   def part(field: str) -> Any:
     name = f"{path}/{field}"
@@ -112,7 +115,8 @@ def _example(kind: Any, path: str, names: Container[str]) -> Any:
       return None
     if field in _NESTED:
       return _example(_NESTED[field], name, names)
-    return 0 if kind is not Observation or name in names else None
+    optional = kind is Observation or field in _OPTIONAL
+    return None if optional and name not in names else 0
 
   return kind(**{field: part(field) for field in kind.__dataclass_fields__})
 

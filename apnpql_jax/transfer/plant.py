@@ -50,7 +50,6 @@ With none, the solver is far from converged in a grip, and the gears give way.
 GEAR_ERP = 0.2
 """Share of a gear's error that Bullet removes in a step."""
 
-
 REFRESH = 75
 """Cycles after which Bullet finds the contacts of the hand again: 0.15 s."""
 

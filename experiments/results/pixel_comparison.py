@@ -4,7 +4,8 @@
   python experiments/results/pixel_comparison.py --tasks push_plate --seeds 0
 
 See ``comparison``. A row has the preset of the task, with its environment steps,
-updates and candidates, and the settings of the row that a search found.
+updates and candidates. Settings of the rows are those that a search from states found
+(experiments/log.md, sac1 to sac4).
 """
 
 from __future__ import annotations

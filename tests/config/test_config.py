@@ -34,6 +34,7 @@ ADDED = {
   "env.randomization": RandomizationConfig(),
   "env.randomization.shape": 0.0,
   "agent.candidate_precision": "float32",
+  "agent.gripper_offset": True,
   "agent.decay_updates": 0,
   "agent.residual_blocks": 0,
   "agent.lstm_instants": 0,

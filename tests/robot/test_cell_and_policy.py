@@ -117,6 +117,7 @@ def test_the_page_shows_the_example():
     ("payload_kg = 0.488", "payload_kg = true", "must be a positive number"),
     ("[0.25, -0.35, 0.005]", "[0.25, -0.35]", "must be three numbers"),
     ("[0.25, -0.35, 0.005]", "[0.25, nan, 0]", "must be three numbers"),
+    ("[0.25, -0.35, 0.005]", "[-inf, -inf, -inf]", "must be three numbers"),
     ("[0.25, -0.35, 0.005]", "[0.9, 0, 0]", "low_m must be below"),
     ("210987654321", "123456789012", "are the same camera"),
     ("[arm]", "[arm", "cannot be read"),

@@ -178,7 +178,8 @@ class RHP12RN:
     # A profile with acceleration is the only one whose velocity can change on the way.
     self._write(table.acceleration, self._read(table.acceleration_limit))
     self._write(table.goal_current, min(current, self._read(table.current_limit)))
-    self._command(self._read(table.present_position), self._velocity(0.0))
+    here = min(max(self._ticks(), OPEN), CLOSED)  # It refuses a goal beyond its range.
+    self._command(here, self._velocity(0.0))
     self._write(table.torque_enable, 1)
     self._about = {
       "model": table.name,
@@ -224,11 +225,15 @@ class RHP12RN:
     self._open_bus().write(fields[0].address, data)
 
   def _read_state(self) -> GripperState:
-    assert self._table
     before = time.monotonic()
-    ticks = self._read(self._table.present_position)
-    ticks -= (ticks >> 31) << 32  # Signed.
+    ticks = self._ticks()
     return GripperState(0.5 * (before + time.monotonic()), ticks * TICK)
+
+  def _ticks(self) -> int:
+    """Returns the measured position, which may lie a little beyond the range."""
+    assert self._table
+    ticks = self._read(self._table.present_position)
+    return ticks - ((ticks >> 31) << 32)  # Signed.
 
   def _check_hardware(self) -> None:
     assert self._table
