@@ -5,7 +5,7 @@
     print(success_rate(learner, held_out_worlds("push_plate", 64)))
 
 Its defaults do not learn from a reward that only the end of an episode gives. What is
-added: half of each batch are transitions of the scripted expert, and critics normalize
+added: half of each batch are transitions of the scripted expert, and networks normalize
 their layers (RLPD, Ball et al. 2023); returns of five steps; inputs of order one; a
 policy that starts narrow. The rest is Stable-Baselines3's.
 """
@@ -41,11 +41,12 @@ def make_sac(
     worlds: Worlds that one program steps.
     updates: Gradient steps after each step of the worlds.
     seed: Of networks, actions and episodes.
-    options: Arguments of ``stable_baselines3.SAC`` that replace these.
+    options: Arguments of ``stable_baselines3.SAC`` that replace these, other than
+      those of the replay.
   """
   replay = load_preset(task).replay
   env = StateVector(StableBaselinesVecEnv(task, worlds, **_shared(task)))
-  returns = {"n_steps": N_STEP, "gamma": GAMMA}
+  returns = {"n_steps": N_STEP, "gamma": options.get("gamma", GAMMA)}
   learner = SAC(
     "MlpPolicy",
     env,
@@ -54,14 +55,14 @@ def make_sac(
       "learning_starts": 0,
       "buffer_size": 200_000,
       "gradient_steps": updates,
-      "replay_buffer_class": HalfDemonstrations,
-      "replay_buffer_kwargs": returns,
       "ent_coef": "auto_0.01",
       "target_entropy": TARGET_ENTROPY,
       "policy_kwargs": {"activation_fn": NormalizedReLU},
       "seed": seed,
       **options,
     },
+    replay_buffer_class=HalfDemonstrations,
+    replay_buffer_kwargs=returns,
   )
   with torch.no_grad():
     learner.actor.log_std.bias.fill_(_INITIAL_LOG_STD)

@@ -12,12 +12,12 @@ from collections.abc import Callable, Sequence
 import dataclasses
 import itertools
 import json
-import os
 from pathlib import Path
 import subprocess
 import sys
 from typing import Any, NamedTuple
 
+from apnpql_jax.atomic import replacing
 from apnpql_jax.cli.sweep import config_of as config_of_options
 from apnpql_jax.config.files import config_diff, config_from_json, format_diff
 from apnpql_jax.config.schema import TrainConfig
@@ -72,6 +72,9 @@ class Comparison:
   greedy: Callable[[Row], str]
   """Row -> acting rule of the second evaluation; the first one draws actions."""
 
+  second: str
+  """Title of the second evaluation in the table."""
+
   axes: Sequence[str] = ("steps",)
   """Horizontal axes of the figure, see ``reports.figure``."""
 
@@ -125,9 +128,8 @@ class Comparison:
       "greedy": greedy,
       "evaluations": evaluations(run),
     }
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(result, indent=1) + "\n")
-    os.replace(part, path)
+    with replacing(path) as part:
+      part.write_text(json.dumps(result, indent=1) + "\n")
     solved = f"{final['successes']} and {greedy['successes']} of {final['episodes']}"
     print(f"{path.stem}: {solved}", flush=True)
 
@@ -164,7 +166,7 @@ class Comparison:
     episodes = [result["final"]["episodes"] for x in found.values() for result in x]
     solved = f"solved of {tables.listed(sorted(set(episodes)))}, by seed"
     head = ["task", "row", "steps", solved, "mean (95 %)"]
-    rows = [[*head, "greedy, by seed", "mean (95 %)", goal]]
+    rows = [[*head, f"{self.second}, by seed", "mean (95 %)", goal]]
     for (task, row), results in found.items():
       shown = [task, row, f"{as_run(results[0]).config.total_steps:,}"]
       for kind in ("final", "greedy"):

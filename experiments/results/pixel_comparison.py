@@ -12,17 +12,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from comparison import Comparison, Row
+from comparison import PAPER, Comparison
+import state_comparison
 
-# Parametric policies start as narrow as the prior is at its widest.
-NARROW = "--agent.policy-initial-std 0.05"
-
-ROWS = {
-  "ap_npql": Row("ap_npql"),
-  "ap_mpo": Row("ap_mpo", NARROW),
-  "ap_sac": Row("ap_sac", f"{NARROW} --agent.epsilon 50 --agent.min-alpha 0.001"),
-  "sac": Row("sac", "--agent.epsilon 10 --agent.min-alpha 0.001"),
-}
+ROWS = {name: state_comparison.ROWS[name] for name in PAPER}
 
 EVAL_EVERY = {
   "push_plate": 2_560,
@@ -50,6 +43,7 @@ COMPARISON = Comparison(
   options=options_of,
   play="--episodes 512 --bank-seed 1",  # Reset states that no evaluation has seen.
   greedy=lambda row: "mean",
+  second="by means",
   axes=("steps", "minutes"),
 )
 

@@ -80,6 +80,7 @@ COMPARISON = Comparison(
   options=options_of,
   play="--episodes 200 --seed 7",
   greedy=greedy_of,
+  second="greedy",
 )
 
 if __name__ == "__main__":

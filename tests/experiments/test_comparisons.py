@@ -47,8 +47,20 @@ def test_rows_of_the_paper_differ_in_the_algorithm_and_its_own_settings(
 @by_folder
 def test_the_stored_results_are_read_and_give_the_stored_table(comparison: Comparison):
   found = comparison.results()
-  assert found
+  assert {task for task, _ in found} <= {*TASKS}
+  assert sum(map(len, found.values())) == len([*comparison.out.glob("*.json")]) > 0
   assert comparison.table(found) == (comparison.out / "table.md").read_text()
+
+
+def test_no_result_from_states_is_missing():
+  comparison = state_comparison.COMPARISON
+  assert len(comparison.results()) == len(TASKS) * len(PAPER) + 2
+
+
+@by_folder
+def test_the_curves_are_drawn_from_the_stored_results(comparison, tmp_path):
+  dataclasses.replace(comparison, out=tmp_path).plot(comparison.results())
+  assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
 
 
 @by_folder
