@@ -32,6 +32,9 @@ With 100, a cup creeps between the pads and slowly pushes the hand open.
 SERVO_GAIN = 0.1
 """Share of the position error that a servo removes in a step."""
 
+FILTER_LAG = 0.010
+"""Lag of the wrench's filter and of the cycle, s; see ``virtual_arm.Admittance``."""
+
 FRICTION = 0.03
 """Coulomb friction of a joint as a share of its largest torque."""
 
@@ -62,8 +65,9 @@ class Plant:
     self.scene = scene
     self._client = bullet.connect()
     self._delay = round(latency_s / TIMESTEP)
+    lag = latency_s + TIMESTEP / SERVO_GAIN + FILTER_LAG
     self._virtual = VirtualArm(
-      ArmModel(), admittance=Admittance() if admittance else None
+      ArmModel(), admittance=Admittance(lag=lag) if admittance else None
     )
 
   def __enter__(self) -> Plant:

@@ -417,6 +417,27 @@ def test_without_an_offset_the_gripper_is_that_of_the_primitives():
   np.testing.assert_array_equal(with_offset.scale_tril, without.scale_tril)
 
 
+@pytest.mark.parametrize(
+  ("settings", "learned"),
+  [
+    ({}, False),
+    ({"gripper_offset": True}, True),
+    ({"prior_mean": "learned"}, True),
+  ],
+)
+def test_the_setting_decides_whether_the_prior_learns_its_gripper(settings, learned):
+  networks = all_networks(dataclasses.replace(CONFIG, **settings))
+  seen = observation(4, pixels=False)
+  params = jax.jit(networks.init)(jax.random.key(0), seen)
+
+  def first(bp):
+    prior = networks.at({**params, "bp": bp}, seen).prior()
+    return prior.gripper_logits[0, 0]
+
+  slope = jax.grad(first)(params["bp"])["out"]["bias"]
+  assert bool(np.any(slope)) == learned
+
+
 def test_a_limit_lets_the_gradient_back_in():
   x = jnp.array([-3.0, -1.0, 0.5, 1.0, 3.0])
   np.testing.assert_array_equal(
