@@ -10,10 +10,13 @@ import subprocess
 import sys
 import textwrap
 
+import pytest
+
 from apnpql_jax import testing
 
 PAGE = (testing.ROOT / "docs" / "library.md").read_text()
-SCRIPT, GYMNASIUM, BRAX = re.findall(r"^```python\n(.*?)^```$", PAGE, re.M | re.S)
+BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE, re.M | re.S)
+SCRIPT, GYMNASIUM, SAC, BRAX = BLOCKS
 
 
 def output(folder: Path, script: str) -> str:
@@ -46,3 +49,10 @@ def test_the_other_interfaces_of_the_library_page_run(tmp_path: Path):
   script += f"  print(envs.reset()[0]['wrist_image'].shape)\n{body}"
   lines = output(tmp_path, prelude + script).splitlines()
   assert lines == ["(2, 36, 64, 3)", "[0. 0.]"]
+
+
+@pytest.mark.slow
+def test_the_sac_of_the_library_page_runs(tmp_path: Path):
+  pytest.importorskip("stable_baselines3")
+  short = SAC.replace("30_720", "32").replace("64", "2")
+  assert output(tmp_path, short).splitlines()[-1] == "0.0"

@@ -103,11 +103,11 @@ class Controller:
     self._last = now
     command = self._command(now, state)
     if command is not None:
-      if command.mode is Mode.STOP and command.at_rest:
+      self._tell(now, command)  # First: an arm with a fault takes no command.
+      if command.mode is Mode.STOP and (command.at_rest or state.fault):
         self._rest()
       else:
         self._arm.send_action(command.position)
-      self._tell(now, command)
     self._board["state"].write(
       {
         "number": self._number,
