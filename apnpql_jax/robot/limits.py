@@ -120,12 +120,16 @@ class MotionLimiter:
     chosen = self._within_joints(chosen)
     if not self._can_stop(chosen):
       chosen = self._within_joints(self._slower(limits.acceleration))
-    return self._advance(chosen, measured)
+    return self._advance(self._near(chosen, measured))
 
   def brake(self, measured: np.ndarray) -> np.ndarray:
-    """Returns the next commanded joint angles f64[6], on the way to rest."""
-    slower = self._slower(self.limits.braking)
-    return self._advance(self._within_joints(slower), measured)
+    """Returns the next commanded joint angles f64[6], on the way to rest.
+
+    The command does not follow an arm that moves away: no joint gets faster.
+    """
+    slower = self._within_joints(self._slower(self.limits.braking))
+    near = self._near(slower, measured)
+    return self._advance(near.clip(np.minimum(slower, 0.0), np.maximum(slower, 0.0)))
 
   @property
   def at_rest(self) -> bool:
@@ -159,11 +163,15 @@ class MotionLimiter:
         return False
     return True
 
-  def _advance(self, velocity: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    if np.isfinite(measured).all():
-      gap, most = measured - self.position, self.limits.deviation
-      velocity = velocity.clip((gap - most) / TIMESTEP, (gap + most) / TIMESTEP)
-      velocity = velocity.clip(-self.limits.velocity, self.limits.velocity)
+  def _near(self, velocity: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """Returns a velocity that keeps the command close to the measured angles."""
+    if not np.isfinite(measured).all():
+      return velocity
+    gap, most = measured - self.position, self.limits.deviation
+    velocity = velocity.clip((gap - most) / TIMESTEP, (gap + most) / TIMESTEP)
+    return velocity.clip(-self.limits.velocity, self.limits.velocity)
+
+  def _advance(self, velocity: np.ndarray) -> np.ndarray:
     self.position = self.position + TIMESTEP * velocity
     self.velocity = velocity
     return self.position.copy()
