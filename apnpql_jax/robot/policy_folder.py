@@ -126,6 +126,10 @@ def _check_arm(folder: PolicyFolder) -> None:
   contract, model = folder.contract, ArmModel()
   if tuple(contract["joints"]["state"][:6]) != JOINTS:
     raise ConfigError(f"the policy in {folder.path} is for an arm with other joints")
+  if contract["joints"].get("ranges", [])[:6] != model.joint_range.tolist():
+    raise ConfigError(
+      f"the policy in {folder.path} is for an arm with other ranges of its joints"
+    )
   position, rotation = model.flange_pose(folder.neutral)
   tool = rotation.T @ (model.tool_position(folder.neutral) - position)
   given = np.array(contract["frames"]["tool_in_flange"]["position_m"])
