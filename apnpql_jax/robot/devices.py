@@ -146,8 +146,9 @@ def needing_packages() -> Generator[None]:
 
 
 def leave_interrupts_to_the_main_process() -> None:
-  """Ignores Ctrl-C, which the terminal sends to all; the main process brakes first."""
-  signal.signal(signal.SIGINT, signal.SIG_IGN)
+  """Ignores signals to all processes: the main process brakes first."""
+  for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP):
+    signal.signal(number, signal.SIG_IGN)
 
 
 def check_kind(kind: str) -> None:

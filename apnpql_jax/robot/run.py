@@ -37,7 +37,7 @@ def run(
     ConfigError: A package is missing.
     FileError: The log exists, or the one to replay is none.
     DeviceError: A device or process has failed.
-    RunStopped: SIGINT or SIGTERM came; the arm is at rest.
+    RunStopped: SIGINT, SIGTERM or SIGHUP came; the arm is at rest.
   """
   if options.log is not None:
     recorder.check_available()
@@ -70,7 +70,7 @@ def run(
 
 @contextlib.contextmanager
 def catching_signals() -> Generator[list[int]]:
-  """Yields a list that gets SIGINT and SIGTERM, which otherwise would end all at once.
+  """Yields a list that gets signals which otherwise would end all at once.
 
   A session ends at the first one, with the arm at rest.
   """
@@ -78,7 +78,7 @@ def catching_signals() -> Generator[list[int]]:
   wake = signal.set_wakeup_fd(-1)  # Of ``runs.signals``, which would end at once.
   before = {
     number: signal.signal(number, lambda number, _: caught.append(number))
-    for number in (signal.SIGINT, signal.SIGTERM)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
   }
   try:
     yield caught
