@@ -1,8 +1,8 @@
 """Records in shared memory, through which the processes of the runtime talk.
 
 Each record has one writer. A reader takes a copy, and takes another one if its number
-or its checksum tells that the writer was at work. Nobody ever waits for a lock, so a
-process that dies cannot hold up the others. Times are those of ``time.monotonic``,
+or its checksum shows that the writer was at work. There are no locks, so a process that
+dies cannot hold up the others for long. Times are those of ``time.monotonic``,
 which all processes of a machine share.
 """
 

@@ -59,7 +59,7 @@ class Core:
     self.supervisor = Supervisor(limits, 0.0)
 
   def start(self, now: float, state: ArmState) -> None:
-    """Begins an episode, or goes on after a pause, from the measured joint angles."""
+    """Starts or resumes an episode from the measured joint angles."""
     self.supervisor = Supervisor(self.limits, now)
     self.virtual.reset(state.position)
     self.supervisor.stop(self.limiter.start(state.position))

@@ -32,9 +32,9 @@ _MODELS = "brown_conrady", "inverse_brown_conrady", "modified_brown_conrady"
 def opencv_lens(lens: Json, model: str, coefficients: Sequence[float]) -> Json:
   """Returns a lens with the maker's distortion.
 
-  Three models of librealsense are OpenCV's but for terms of higher order, which move a
-  pixel of a D455 by less than 0.01 px. (librealsense 2.59 also projects "inverse" ones
-  from ideal to real pixels.)
+  Three models of librealsense are OpenCV's except for terms of higher order, which move
+  a pixel of a D455 by less than 0.01 px. (librealsense 2.59 also projects "inverse"
+  ones from ideal to real pixels.)
 
   Args:
     lens: The lens without its distortion.

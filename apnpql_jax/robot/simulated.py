@@ -59,12 +59,12 @@ PARKED = np.array([0.15, 0.1, -0.1, 0.1, 0.05, -0.1])
 """Where the arm begins, rad from the neutral pose, so that it has to go there."""
 
 
-class SimulatedArm:
-  """See ``protocols.Arm``."""
+class _OnBoard:
+  """A device whose measurements and commands are on the plant's board."""
 
   def __init__(self, plant: str):
-    """Keeps the name of the plant's board."""
-    self._name, self._zeroed = plant, 0
+    """Keeps the name of the board."""
+    self._name = plant
     self._board: Board | None = None
 
   def connect(self) -> None:
@@ -76,6 +76,12 @@ class SimulatedArm:
     if self._board is not None:
       self._board.close()
     self._board = None
+
+
+class SimulatedArm(_OnBoard):
+  """See ``protocols.Arm``."""
+
+  _zeroed = 0
 
   def describe(self) -> dict[str, Any]:
     """See ``Device.describe``."""
@@ -108,23 +114,8 @@ class SimulatedArm:
     )
 
 
-class SimulatedGripper:
+class SimulatedGripper(_OnBoard):
   """See ``protocols.Gripper``."""
-
-  def __init__(self, plant: str):
-    """Keeps the name of the plant's board."""
-    self._name = plant
-    self._board: Board | None = None
-
-  def connect(self) -> None:
-    """See ``Device.connect``."""
-    self._board = Board(self._name, RECORDS)
-
-  def disconnect(self) -> None:
-    """See ``Device.disconnect``."""
-    if self._board is not None:
-      self._board.close()
-    self._board = None
 
   def describe(self) -> dict[str, Any]:
     """See ``Device.describe``."""

@@ -64,7 +64,7 @@ class Cell:
         bullet.require(f"{option} {value}")
 
   def about(self) -> dict[str, Any]:
-    """Returns what the result says about the cell."""
+    """Returns the parts of the result that describe the cell."""
     about = {k: getattr(self, k) for k in ("physics", "renderer", "looks")}
     if self.physics == "bullet":
       about |= {"latency_ms": self._latency_ms, "admittance": self.admittance}

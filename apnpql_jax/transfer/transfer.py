@@ -1,7 +1,7 @@
 """Held-out episodes of a policy or of the expert in worlds that training did not have.
 
 A cell is a choice of physics, renderer and looks. The expert acts on privileged poses,
-so that its success depends on the physics alone. Where it fails, a cell says nothing
+so that its success depends on the physics alone. Where it fails, a cell is no evidence
 about a policy.
 """
 
@@ -42,7 +42,7 @@ from apnpql_jax.transfer.play import Act, Draw, Played, play
 from apnpql_jax.types import Array
 
 EXPERT_SUFFICES = 0.95
-"""Success rate of the expert from which on a cell tells something about a policy."""
+"""Success rate of the expert above which a cell is evidence about a policy."""
 
 _POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat")
 
@@ -173,7 +173,7 @@ def _draw_of(env: Env, cell: Cell, stack: contextlib.ExitStack) -> Draw | None:
 def _filmed(
   env: Env, played: list[Played], video: Path | None, draw: Draw | None
 ) -> dict[str, Any]:
-  """Writes the video, if asked for; returns what the result says about it."""
+  """Writes the video, if asked for; returns its part of the result."""
   if video is None:
     return {}
   found: dict[str, Any] = {"video": None}

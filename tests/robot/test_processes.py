@@ -130,14 +130,32 @@ def until(condition: Callable[[], bool], seconds: float = 120.0) -> float:
 
 
 def start_motion(board: Board) -> None:
-  """Homes the arm, and returns when the policy moves it."""
-  order = {"number": 1, "phase": Phase.HOME, "target": NEUTRAL, "close": 1}
-  board["order"].write(order)
-  until(lambda: bool(board["state"].read()["done"]))
+  """Homes the arm, and returns when the policy moves it.
+
+  A busy machine may starve a process for so long that a limit stops the arm, which is
+  not what these tests are about. So it tries again.
+  """
+  reasons = []
+  for number in (1, 3, 5):
+    order = {"number": number, "phase": Phase.HOME, "target": NEUTRAL, "close": 1}
+    board["order"].write(order)
+    until(lambda n=number: is_done(board, n))
+    if np.abs(board["state"].read()["position"] - NEUTRAL).max() < 0.01:
+      board["order"].write({"number": number + 1, "phase": Phase.PLAY})
+      until(lambda n=number: is_fast(board) or is_done(board, n + 1))
+      if is_fast(board):
+        return
+    reasons.append(board["state"].read()["reason"].decode())
+  raise AssertionError(f"the arm stopped: {reasons}")
+
+
+def is_done(board: Board, number: int) -> bool:
   state = board["state"].read()
-  assert np.abs(state["position"] - NEUTRAL).max() < 0.01
-  board["order"].write({"number": 2, "phase": Phase.PLAY})
-  until(lambda: abs(board["state"].read()["velocity"][0]) > 0.5)
+  return bool(state["number"] == number and state["done"])
+
+
+def is_fast(board: Board) -> bool:
+  return abs(board["state"].read()["velocity"][0]) > 0.5
 
 
 def speed(plant: Board) -> float:

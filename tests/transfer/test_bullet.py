@@ -178,42 +178,45 @@ def test_fingers_move_together_at_the_speed_of_the_motor(plant):
   np.testing.assert_allclose(-np.diff(gap) / PERIOD_S, motors.GRIPPER_SPEED, rtol=0.05)
 
 
-def test_pads_hold_a_box_that_the_arm_lifts(plant):
+def between_pads(data: mujoco.MjData) -> np.ndarray:
+  """Returns where the center of a gripped box is."""
+  tool = data.site("tool")
+  return tool.xpos - float(pinch_height(SIDE)) * tool.xmat.reshape(3, 3)[:, 2]
+
+
+def begin_with_box(plant: Plant) -> mujoco.MjData:
+  """Starts with the yellow box between the pads; returns that state in MuJoCo."""
   qpos = begin(plant)
-  model, data = plant.scene.model, mujoco.MjData(plant.scene.model)
+  data = mujoco.MjData(plant.scene.model)
   qpos[6:10] = finger_angle(SIDE)
   data.qpos[:] = qpos
-  mujoco.mj_kinematics(model, data)
+  mujoco.mj_kinematics(plant.scene.model, data)
   at, _ = plant.scene.free_joint("yellow")
-  tool = data.site("tool")
   quat = np.zeros(4)
-  mujoco.mju_mat2Quat(quat, tool.xmat)
-  pads = tool.xpos - float(pinch_height(SIDE)) * tool.xmat.reshape(3, 3)[:, 2]
-  qpos[at : at + 7] = [*pads, *quat]
-  plant.begin(qpos, data.mocap_pos, data.mocap_quat, {})
+  mujoco.mju_mat2Quat(quat, data.site("tool").xmat)
+  data.qpos[at : at + 7] = [*between_pads(data), *quat]
+  plant.begin(data.qpos.copy(), data.mocap_pos, data.mocap_quat, {})
+  return data
+
+
+def test_pads_hold_a_box_that_the_arm_lifts(plant):
+  data = begin_with_box(plant)
+  pads = between_pads(data)
   plant.step(np.zeros(6), 1.0, PERIOD_S)
   for _ in range(6):
     plant.step(np.array([0.2, -0.2, 0, 0, 0, 0]), 1.0, PERIOD_S)
   data.qpos[:], _ = plant.bodies.state()
-  mujoco.mj_kinematics(model, data)
-  moved = tool.xpos - float(pinch_height(SIDE)) * tool.xmat.reshape(3, 3)[:, 2]
+  mujoco.mj_kinematics(plant.scene.model, data)
+  moved = between_pads(data)
+  at, _ = plant.scene.free_joint("yellow")
   assert np.linalg.norm(moved - pads) > 0.03
   np.testing.assert_allclose(data.qpos[at : at + 3], moved, atol=3e-3)
 
 
 def test_contacts_turn_with_the_hand(plant):
   """After half a turn with a box, all contacts push the pads apart."""
-  qpos = begin(plant)
-  model, data = plant.scene.model, mujoco.MjData(plant.scene.model)
-  qpos[6:10] = finger_angle(SIDE)
-  data.qpos[:] = qpos
-  mujoco.mj_kinematics(model, data)
-  at, _ = plant.scene.free_joint("yellow")
-  tool, quat = data.site("tool"), np.zeros(4)
-  mujoco.mju_mat2Quat(quat, tool.xmat)
-  pads = tool.xpos - float(pinch_height(SIDE)) * tool.xmat.reshape(3, 3)[:, 2]
-  qpos[at : at + 7] = [*pads, *quat]
-  plant.begin(qpos, data.mocap_pos, data.mocap_quat, {})
+  begin_with_box(plant)
+  model = plant.scene.model
   for _ in range(26):
     plant.step(np.array([0, 0, 0, 0, 0, 1.0]), 1.0, PERIOD_S)
   plant.step(np.zeros(6), 1.0, 0.02)

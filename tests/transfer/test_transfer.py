@@ -98,7 +98,7 @@ def test_the_loop_plays_the_episodes_of_the_player(env):
 
 
 def test_bullet_moves_the_worlds_that_still_run(env):
-  """The state holds Bullet's poses, and an episode goes on without a reset."""
+  """The state holds Bullet's poses, and an episode continues without a reset."""
   pytest.importorskip("pybullet")
   state, act = env.reset(jnp.asarray(ROWS)), jax.jit(env.expert_action)
   running = np.array([True, True, False])

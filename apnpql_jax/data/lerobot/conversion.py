@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -125,28 +126,25 @@ def _column(dataset: Dataset, names: list[str]) -> np.ndarray:
 
 def _position_names(model: mujoco.MjModel) -> list[str]:
   """Returns names of qpos, then of the poses of mocap bodies."""
-  names = []
-  for i in range(model.njnt):
-    kind, joint = model.jnt_type[i], _joint_name(model, i)
-    if kind == _FREE:
-      names += [f"{model.body(model.jnt_bodyid[i]).name}.{x}" for x in _POSE]
-    else:
-      ball = kind == _BALL
-      names += [f"{joint}.{x}" for x in (_POSE[3:] if ball else ("position",))]
   bodies = np.argsort(model.body_mocapid)[model.nbody - model.nmocap :]
-  return [*names, *(f"{model.body(i).name}.{x}" for i in bodies for x in _POSE)]
+  poses = [f"{model.body(i).name}.{x}" for i in bodies for x in _POSE]
+  return _state_names(model, _POSE, "position") + poses
 
 
 def _velocity_names(model: mujoco.MjModel) -> list[str]:
   """Returns names of qvel."""
+  return _state_names(model, _TWIST, "velocity")
+
+
+def _state_names(model: mujoco.MjModel, parts: Sequence[str], single: str) -> list[str]:
+  """Returns names for all joints: ``parts`` of a free joint, ``single`` of a hinge."""
   names = []
   for i in range(model.njnt):
     kind, joint = model.jnt_type[i], _joint_name(model, i)
     if kind == _FREE:
-      names += [f"{model.body(model.jnt_bodyid[i]).name}.{x}" for x in _TWIST]
+      names += [f"{model.body(model.jnt_bodyid[i]).name}.{x}" for x in parts]
     else:
-      ball = kind == _BALL
-      names += [f"{joint}.{x}" for x in (_TWIST[3:] if ball else ("velocity",))]
+      names += [f"{joint}.{x}" for x in (parts[3:] if kind == _BALL else (single,))]
   return names
 
 

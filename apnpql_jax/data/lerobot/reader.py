@@ -113,7 +113,7 @@ def _read(folder: Path) -> Dataset:
     raise FileError(
       f"its version is {str(info['codebase_version'])[:20]}, not {layout.VERSION}"
     )
-  features, fps = info["features"], float(info["fps"])
+  features = info["features"]
   for name in (STATE, ACTION):
     if features.get(name, {}).get("shape") != [7]:
       raise FileError(f"it has no {name} of 7 numbers: six joints and the gripper")
@@ -124,14 +124,9 @@ def _read(folder: Path) -> Dataset:
     and len(about["shape"]) == 1
     and name not in COUNTERS
   }
-  videos = [name for name, about in features.items() if about["dtype"] == "video"]
-  about = folder / layout.ABOUT
-  found = Dataset(
-    fps,
-    vectors,
-    [],
-    json.loads(about.read_text(encoding="utf-8")) if about.exists() else {},
-  )
+  path = folder / layout.ABOUT
+  about = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+  found = Dataset(float(info["fps"]), vectors, [], about)
   if not info["total_episodes"]:
     return found
   table = _table(folder / layout.TASKS)
@@ -153,38 +148,47 @@ def _read(folder: Path) -> Dataset:
     )
     if name not in files:
       files = {name: _table(folder / name)}
-    data = files[name]
-    mine = data["episode_index"].to_numpy() == row["episode_index"]
-    columns = {
-      key: _numbers(data[key], mine) for key in vectors.keys() | {"task_index"}
-    }
-    count = len(columns[ACTION])
-    if count != row["length"] or not count:
-      raise FileError(
-        f"{name} has {count} frames of episode {row['episode_index']}, "
-        f"not {row['length']}"
-      )
-    task = tasks[int(columns.pop("task_index")[0, 0])]
-    success = SUCCESS in data.column_names and _numbers(data[SUCCESS], mine)[-1, 0]
-    places = {
-      key: (
-        folder
-        / info["video_path"].format(
-          video_key=key,
-          chunk_index=row[f"videos/{key}/chunk_index"],
-          file_index=row[f"videos/{key}/file_index"],
-        ),
-        float(row[f"videos/{key}/from_timestamp"]),
-      )
-      for key in videos
-    }
-    time = np.arange(count) / fps
-    found.episodes.append(Episode(task, time, columns, bool(success), places))
+    found.episodes.append(_episode(folder, info, row, name, files[name], tasks, found))
   if len(found.episodes) != info["total_episodes"]:
     raise FileError(
       f"it lists {len(found.episodes)} of {info['total_episodes']} episodes"
     )
   return found
+
+
+def _episode(
+  folder: Path,
+  info: dict[str, Any],
+  row: dict[str, Any],
+  name: str,
+  data: Any,
+  tasks: dict[int, str],
+  dataset: Dataset,
+) -> Episode:
+  """Returns the episode of a row of meta/episodes; ``data`` is its file ``name``."""
+  mine = data["episode_index"].to_numpy() == row["episode_index"]
+  columns = {
+    key: _numbers(data[key], mine) for key in dataset.names.keys() | {"task_index"}
+  }
+  count = len(columns[ACTION])
+  if count != row["length"] or not count:
+    raise FileError(
+      f"{name} has {count} frames of episode {row['episode_index']}, "
+      f"not {row['length']}"
+    )
+  task = tasks[int(columns.pop("task_index")[0, 0])]
+  success = SUCCESS in data.column_names and _numbers(data[SUCCESS], mine)[-1, 0]
+  videos = {}
+  for key, about in info["features"].items():
+    if about["dtype"] == "video":
+      path = info["video_path"].format(
+        video_key=key,
+        chunk_index=row[f"videos/{key}/chunk_index"],
+        file_index=row[f"videos/{key}/file_index"],
+      )
+      videos[key] = folder / path, float(row[f"videos/{key}/from_timestamp"])
+  time = np.arange(count) / dataset.fps
+  return Episode(task, time, columns, bool(success), videos)
 
 
 def _table(path: Path) -> Any:

@@ -94,16 +94,8 @@ def calibrate(
       raise ConfigError("cameras without an arm give no views")
     for name, camera in cameras.items():
       views.record(folder / name, kind, arm, camera, ask=ask)
-  # The wrist first: it finds the board on the table.
-  known = sorted(contract["cameras"], reverse=True)
-  if not known:
-    raise ConfigError("the policy sees no images, so no camera is to be calibrated")
-  names = [name for name in known if (folder / name).is_dir()]
-  if not names:
-    wanted = " or ".join(str(folder / name) for name in known)
-    raise FileError(f"there are no views in {wanted}")
   found: dict[str, _Found] = {}
-  for name in names:
+  for name in _names(contract, folder):
     try:
       if serials is not None:
         views.check_serial(folder / name, serials[name])
@@ -131,6 +123,22 @@ def calibrate(
     "pictures": [str(x) for x in pictures if x is not None],
     **{name: _summary(x.about) for name, x in checked.items()},
   }
+
+
+def _names(contract: Json, folder: Path) -> list[str]:
+  """Returns the cameras with views, the wrist's first: it finds a board on the table.
+
+  Raises:
+    UserError: There are none.
+  """
+  known = sorted(contract["cameras"], reverse=True)
+  if not known:
+    raise ConfigError("the policy sees no images, so no camera is to be calibrated")
+  names = [name for name in known if (folder / name).is_dir()]
+  if not names:
+    wanted = " or ".join(str(folder / name) for name in known)
+    raise FileError(f"there are no views in {wanted}")
+  return names
 
 
 def _calibrate_one(

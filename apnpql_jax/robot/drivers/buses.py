@@ -71,7 +71,7 @@ class Dynamixel:
   def write(self, address: int, data: bytes) -> None:
     """See ``Bus``."""
     *_, error = self._try(self._packets.writeTxRx, address, len(data), list(data))
-    if error & 0x7F:  # Bit 7 tells of a hardware error, which has its own reading.
+    if error & 0x7F:  # Bit 7 is for hardware errors, which are read separately.
       reason = one_line(Exception(self._packets.getRxPacketError(error & 0x7F)))
       raise DeviceError(f"{self._where}: it refuses to write {address}: {reason}")
 

@@ -16,7 +16,7 @@ from apnpql_jax.errors import DeviceError, one_line
 
 _SCRIPT, _RTDE = 30003, 30004
 _PATIENCE = 2.0  # s for a server to answer
-_OLDEST = 5, 6  # PolyScope that tells whether remote control is on
+_OLDEST = 5, 6  # PolyScope that reports whether remote control is on
 _HELLO = struct.pack(">HBH", 5, ord("V"), 2)  # asks for version 2 of RTDE
 _WELCOME = struct.pack(">HB?", 4, ord("V"), True)
 
@@ -67,7 +67,7 @@ def check_rtde(host: str) -> None:
 
 
 def _ask_dashboard(host: str, module: Any) -> tuple[dict[str, Any], bool]:
-  """Returns what the dashboard server tells, and whether it is in remote control."""
+  """Returns model and versions, and whether the arm is in remote control."""
   client = module.DashboardClient(host)
   try:
     client.connect()

@@ -125,8 +125,8 @@ class Reports:
 class Clock:
   """The controller's clock in terms of ``time.monotonic``.
 
-  A package cannot arrive before it was sent, so the least difference of both clocks
-  holds, but for their drift.
+  A packet cannot arrive before it was sent. So the smallest difference of both clocks
+  is used, corrected for their drift.
   """
 
   _DRIFT = 1e-4  # s per s, more than that of quartz clocks
