@@ -12,7 +12,7 @@ from typing import Any
 
 from apnpql_jax.errors import INTERRUPTED, DeviceError, RunStopped
 from apnpql_jax.robot import control_process, policy_process, simulated
-from apnpql_jax.robot.board import Board, Phase
+from apnpql_jax.robot.board import Board, Phase, text
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.supervisor import Mode
@@ -135,7 +135,7 @@ class Session(contextlib.AbstractContextManager):
     state = self.board["state"].read()
     if state["mode"] == Mode.STOP:
       raise DeviceError(
-        f"the arm does not reach its neutral pose: {state['reason'].decode()}"
+        f"the arm does not reach its neutral pose: {text(state['reason'])}"
       )
 
   def play(self, watch: Callable[[Any], None] | None = None) -> Outcome:
@@ -161,7 +161,7 @@ class Session(contextlib.AbstractContextManager):
     self._wait(over, limit * self._clock.slowdown, "the episode to end")
     seconds = self._clock.now() - begin
     stopped = self._is_done()
-    reason = self.board["state"].read()["reason"].decode() if stopped else ""
+    reason = text(self.board["state"].read()["reason"]) if stopped else ""
 
     def policy_ended() -> bool:
       """Returns true, too, if it has not begun, as after a stop in the first cycle."""
@@ -259,9 +259,9 @@ class Session(contextlib.AbstractContextManager):
     if self._signals:
       name = signal.Signals(self._signals[0]).name
       raise RunStopped(f"{name}: the arm is at rest", INTERRUPTED + self._signals[0])
-    failure = self._failure or self.board["policy"].read()["error"].decode()
+    failure = self._failure or text(self.board["policy"].read()["error"])
     if not failure and self._plant is not None:
-      failure = self._plant["plant"].read()["error"].decode()
+      failure = text(self._plant["plant"].read()["error"])
     ended = [name for name, x in self.processes.items() if not x.is_alive()]
     if failure or ended:
       # The control process first brings the arm to rest.

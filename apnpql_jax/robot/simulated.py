@@ -18,7 +18,7 @@ import numpy as np
 
 from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot import devices
-from apnpql_jax.robot.board import TEXT, Board
+from apnpql_jax.robot.board import TEXT, Board, text
 from apnpql_jax.robot.clock import Clock
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.limits import TIMESTEP
@@ -90,7 +90,7 @@ class SimulatedArm(_OnBoard):
   def get_observation(self) -> ArmState:
     """See ``Arm.get_observation``."""
     found = _opened(self._board)["plant"].read()
-    error = found["error"].decode()
+    error = text(found["error"])
     if error:
       raise DeviceError(f"simulated arm: {error}")
     return ArmState(
@@ -154,7 +154,7 @@ def started(robot: Robot, *, seed: int = 0, latency_s: float = 0.0) -> Generator
     process.start()
     try:
       while not board["plant"].read()["ready"]:
-        error = board["plant"].read()["error"].decode()
+        error = text(board["plant"].read()["error"])
         if error or not process.is_alive():
           raise DeviceError(f"simulated robot: {error or 'it does not start'}")
         time.sleep(0.01)

@@ -18,10 +18,9 @@ import time
 from typing import Any
 
 import numpy as np
-import pytest
 
 from apnpql_jax.robot import control_process, simulated
-from apnpql_jax.robot.board import Board, Phase, Record
+from apnpql_jax.robot.board import Board, Phase, text
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
 from apnpql_jax.robot.devices import Robot
@@ -145,7 +144,7 @@ def start_motion(board: Board) -> None:
       until(lambda n=number: is_fast(board) or is_done(board, n + 1))
       if is_fast(board):
         return
-    reasons.append(board["state"].read()["reason"].decode())
+    reasons.append(text(board["state"].read()["reason"]))
   raise AssertionError(f"the arm stopped: {reasons}")
 
 
@@ -205,40 +204,3 @@ def _alive(pid: int) -> bool:
   except OSError:
     return False
   return state != "Z" and os.path.exists(f"/proc/{pid}")
-
-
-def test_a_reader_never_sees_half_a_record():
-  """A writer in another process, as fast as it can."""
-  with Board(records=FLOOD) as board:
-    process = get_context("spawn").Process(target=flood, args=(board.name,))
-    process.start()
-    until(lambda: board["block"].read()["number"] > 0)
-    numbers = []
-    for _ in range(3000):
-      found = board["block"].read()
-      assert (found["values"] == found["number"]).all()
-      numbers.append(int(found["number"]))
-    process.kill()
-    process.join()
-    assert numbers == sorted(numbers) and numbers[-1] > numbers[0]
-
-
-FLOOD = {"block": [("number", "i8"), ("values", "i8", 500)]}
-
-
-def flood(name: str) -> None:
-  board, number = Board(name, FLOOD), 0
-  while True:
-    number += 1
-    board["block"].write({"number": number, "values": number})
-
-
-def test_a_record_that_stays_half_written_is_an_error():
-  fields = [("number", "i8")]
-  buffer = bytearray(Record.size(fields))
-  record = Record(memoryview(buffer), fields)
-  record.write({"number": 7})
-  assert Record(memoryview(buffer), fields).read()["number"] == 7
-  buffer[0] += 1
-  with pytest.raises(Exception, match="half-written"):
-    Record(memoryview(buffer), fields).read()
