@@ -71,6 +71,13 @@ class Limits:
   joint_age: float = 0.02
   """Age of the measured joints from which the arm stops, s."""
 
+  gripper_age: float = 0.2
+  """Age of the gripper's measurement from which the arm stops, s.
+
+  Its line is slow: a reading takes up to 20 ms, as do a command and an error check
+  between two readings. The rest is for answers that get lost.
+  """
+
   period: float = 0.15
   """Control period of the policy, s. One period late the arm holds, two it stops."""
 

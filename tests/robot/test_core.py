@@ -12,7 +12,7 @@ import pytest
 from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.core import Command, Core
 from apnpql_jax.robot.limits import BRAKING, TIMESTEP, Limits
-from apnpql_jax.robot.protocols import ArmState
+from apnpql_jax.robot.protocols import ArmState, GripperState
 from apnpql_jax.robot.supervisor import Action, Mode
 from apnpql_jax.robot.virtual_arm import LEAD, Admittance, VirtualArm
 
@@ -38,6 +38,8 @@ class World:
     self.arm, self.speed, self.wrench = NEUTRAL.copy(), np.zeros(6), np.zeros(6)
     self.action: Action | None = None
     self.measured_at: float | None = None
+    self.gripper_at: float | None = None
+    self.fault = ""
     self.core.start(0.0, self.state())
 
   @property
@@ -46,7 +48,7 @@ class World:
 
   def state(self, fault: str = "") -> ArmState:
     time = self.now if self.measured_at is None else self.measured_at
-    return ArmState(time, self.arm.copy(), self.speed, self.wrench, fault)
+    return ArmState(time, self.arm.copy(), self.speed, self.wrench, fault or self.fault)
 
   def act(self, values: np.ndarray, frame_age: float = 0.03) -> None:
     number = self.action.number + 1 if self.action else 1
@@ -54,6 +56,8 @@ class World:
     self.action = Action(number, self.now, np.asarray(values, float), frames)
 
   def step(self, fault: str = "") -> Command:
+    gripper = GripperState(self.gripper_at or self.now, 0.0)
+    self.core.supervisor.check_gripper(self.now, gripper)
     command = self.core.step(self.now, self.state(fault), self.action)
     before = self.arm
     self.arm = before + (TIMESTEP / self.lag) * (command.position - before)
@@ -119,10 +123,21 @@ def silent_policy(world: World) -> None:
   world.cycle += 2 * PERIOD  # The arm coasts meanwhile, in this world without time.
 
 
+def silent_gripper(world: World) -> None:
+  world.gripper_at = world.now - 0.201
+
+
+def dropped_arm(world: World) -> None:
+  """The last measurement stays, and the driver says why a while later."""
+  world.measured_at = world.now - 0.2
+  world.fault = LOST
+
+
 def killed_policy(world: World) -> None:
   world.core.supervisor.stop("policy: its process has ended")
 
 
+LOST = "lost the connection to the controller: check network and power"
 FAULTS = {
   "policy: the action is not finite": (nan_action, Mode.HOLD),
   "camera wrist: frame is 101 ms old": (stale_frame, Mode.HOLD),
@@ -133,6 +148,8 @@ FAULTS = {
   "force: above 30 N on the tool": (push(31), Mode.HOLD),
   "force: 51 N on the tool": (push(-51), Mode.STOP),
   "policy: a period late": (silent_policy, Mode.HOLD),
+  "gripper: measurement is 201 ms old": (silent_gripper, Mode.STOP),
+  f"arm: {LOST}": (dropped_arm, Mode.STOP),
   "policy: its process has ended": (killed_policy, Mode.STOP),
 }
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from apnpql_jax.robot import control_process, simulated
+from apnpql_jax.robot import control_process, simulated, simulation
 from apnpql_jax.robot.board import Board, Phase, text
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
@@ -30,7 +30,10 @@ NEUTRAL = np.array([-1.8957, -1.7712, 1.9888, -1.7884, -1.5708, -0.3249])
 CONTRACT: dict[str, Any] = {
   "task": "push_plate",
   "control_period_s": 0.15,
-  "joints": {"ranges": [[-6.28, 6.28]] * 7},
+  "joints": {
+    "ranges": [[-6.28, 6.28]] * 7,
+    "gripper": {"open_rad": 0.0, "closed_rad": 1.1},
+  },
 }
 CLOCK = Clock(10.0)
 PARENT_KILLED = """
@@ -163,7 +166,7 @@ def speed(plant: Board) -> float:
 
 
 def test_a_killed_policy_brings_the_arm_to_rest_and_control_has_no_jax():
-  with rig() as (board, run), Board(run.plant, simulated.RECORDS) as plant:
+  with rig() as (board, run), Board(run.plant, simulation.RECORDS) as plant:
     start_motion(board)
     run.policy.kill()
     assert until(lambda: speed(plant) < 0.01) < 0.5
@@ -177,7 +180,7 @@ def test_a_killed_policy_brings_the_arm_to_rest_and_control_has_no_jax():
 
 
 def test_a_killed_control_process_ends_the_policy_and_the_arm_keeps_its_place():
-  with rig() as (board, run), Board(run.plant, simulated.RECORDS) as plant:
+  with rig() as (board, run), Board(run.plant, simulation.RECORDS) as plant:
     start_motion(board)
     run.control.kill()
     until(lambda: not run.policy.is_alive())
