@@ -54,9 +54,11 @@ RECORDS = {
     ("wrench", "f8", 6),
     ("command", "f8", 6),
     ("gripper", "f8"),
+    ("gripper_time", "f8"),
     ("mode", "i8"),
     ("reason", TEXT),
     ("done", "i8"),
+    ("at_rest", "i8"),
     ("periods", "i8", PERIOD_BINS),
   ],
   # From the policy process; "order" is that of the episode.
