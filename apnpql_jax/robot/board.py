@@ -61,7 +61,8 @@ RECORDS = {
     ("at_rest", "i8"),
     ("periods", "i8", PERIOD_BINS),
   ],
-  # From the policy process; "order" is that of the episode.
+  # From the policy process; "order" is that of the episode, "ended" that of the last
+  # one that has ended and is in the log, "index" its number there or -1.
   "action": [
     ("order", "i8"),
     ("number", "i8"),
@@ -73,8 +74,11 @@ RECORDS = {
     ("ready", "i8"),
     ("order", "i8"),
     ("actions", "i8"),
+    ("missed", "i8"),
     ("over", "i8"),
     ("solved", "i8"),
+    ("ended", "i8"),
+    ("index", "i8"),
     ("delay", "f8"),
     ("error", TEXT),
   ],

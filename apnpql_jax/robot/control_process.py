@@ -41,7 +41,7 @@ def main(
     board_name: Name of the board.
     options: ``admittance``: whether contacts move the virtual arm.
     events: Gets changes of the mode, and an error that ends the process, as text.
-    peer: Its other end is with the policy process alone.
+    peer: Its other end is with the policy process alone, which may send why it ends.
   """
   devices.leave_interrupts_to_the_main_process()
   # More often than every 5 ms, so that the drivers' threads do not hold up cycles.
@@ -73,17 +73,15 @@ def main(
 def _loop(control: Control, clock: Clock, peer: Pipe) -> None:
   """Runs cycles until told to quit, and to rest if another process has ended."""
   parent = parent_process()
-  ends = {peer.fileno(): "policy: its process has ended"}
-  if parent is not None:
-    ends[int(parent.sentinel)] = "session: the main process has ended"
   poll = select.poll()
-  for number in ends:
-    poll.register(number, select.POLLIN | select.POLLHUP)
+  for source in (peer.fileno(), *([int(parent.sentinel)] if parent else [])):
+    poll.register(source, select.POLLIN | select.POLLHUP)
   ended, due, patience = "", clock.now(), REST_S
   while True:
     if not ended:
-      for number, _ in poll.poll(0):
-        ended = ended or ends[number]
+      for source, _ in poll.poll(0):
+        mine = source == peer.fileno()
+        ended = _last_words(peer) if mine else "session: the main process has ended"
     if ended:
       control.end_motion(ended)
     control.cycle()
@@ -93,6 +91,13 @@ def _loop(control: Control, clock: Clock, peer: Pipe) -> None:
       patience -= TIMESTEP
     due = max(due + TIMESTEP, clock.now() - TIMESTEP)  # Late cycles are left out.
     clock.sleep(due - clock.now())
+
+
+def _last_words(peer: Pipe) -> str:
+  """Returns why the policy process has ended."""
+  with contextlib.suppress(EOFError, OSError):
+    return str(peer.recv())
+  return "policy: its process has ended"
 
 
 def _ask_for_priority() -> None:

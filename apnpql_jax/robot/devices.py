@@ -51,6 +51,11 @@ class Robot:
   plant: str = ""
   """Name of the shared memory of a simulated plant."""
 
+  @property
+  def can_judge(self) -> bool:
+    """Whether it shows that the task is solved; no sensor of a real arm does."""
+    return self.kind == "simulated"
+
 
 @contextlib.contextmanager
 def open_arm(robot: Robot) -> Generator[tuple[Arm, Gripper]]:

@@ -16,6 +16,9 @@ from apnpql_jax.robot.supervisor import CAMERAS
 ROBOT_TYPE = "ur5e_rh_p12_rn"
 _COMMAND = "observation.command"
 _WRENCH = "observation.wrench"
+_TIMES = "times"
+"""Column of times since the beginning of the episode, s. Its name makes it no input of
+LeRobot's policies, which take all columns of "observation"."""
 _AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
 
 
@@ -41,8 +44,13 @@ def recorded_actions(folder: Path) -> list[np.ndarray]:
 class Recorder:
   """Writes episodes when they end, because encoding takes longer than a period."""
 
-  def __init__(self, folder: Path, contract: dict[str, Any]):
+  def __init__(self, folder: Path, contract: dict[str, Any], *, judged: bool):
     """Makes the folder.
+
+    Args:
+      folder: Folder to make.
+      contract: That of the policy.
+      judged: Whether the success of an episode is known, see ``lerobot.Writer``.
 
     Raises:
       ConfigError: A package is missing.
@@ -51,7 +59,7 @@ class Recorder:
     self._lerobot = _lerobot()
     joints = contract["joints"]["state"]
     cameras = contract["cameras"]
-    self._task, self._rows = contract["task"], []
+    self._task, self._rows, self._count = contract["task"], [], 0
     self._writer = self._lerobot.Writer(
       folder,
       fps=1 / contract["control_period_s"],
@@ -60,6 +68,7 @@ class Recorder:
         self._lerobot.ACTION: tuple(contract["action"]["order"]),
         _COMMAND: tuple(joints[:6]),
         _WRENCH: _AXES,
+        _TIMES: (*CAMERAS, "joints", "gripper", "action"),
       },
       images={
         f"{self._lerobot.IMAGES}{name}": (
@@ -70,6 +79,7 @@ class Recorder:
       },
       robot_type=ROBOT_TYPE,
       about={"contract": contract},
+      judged=judged,
     )
 
   def __enter__(self) -> Recorder:
@@ -78,25 +88,45 @@ class Recorder:
   def __exit__(self, *error: object) -> None:
     self._writer.close()
 
-  def add(self, state: Any, action: np.ndarray, frames: Sequence[Frame]) -> None:
-    """Keeps an instant: a record "state" of the board, the action, and the frames."""
+  def add(
+    self,
+    begin: float,
+    now: float,
+    state: Any,
+    action: np.ndarray,
+    frames: Sequence[Frame],
+  ) -> None:
+    """Keeps an instant.
+
+    Args:
+      begin: When the episode began, s.
+      now: When the action was chosen, s.
+      state: Record "state" of the board.
+      action: The action f32[7].
+      frames: What the cameras saw.
+    """
+    times = [*(x.time for x in frames), state["time"], state["gripper_time"], now]
     row = {
       self._lerobot.STATE: np.append(state["position"], state["gripper"]),
       self._lerobot.ACTION: action,
       _COMMAND: state["command"],
       _WRENCH: state["wrench"],
+      _TIMES: np.array(times) - begin,
     }
     for name, frame in zip(CAMERAS, frames, strict=True):
       row[f"{self._lerobot.IMAGES}{name}"] = frame.image
     self._rows.append(row)
 
-  def end_episode(self, success: bool) -> None:
-    """Writes the episode, if it has instants."""
+  def end_episode(self, success: bool | None) -> int | None:
+    """Writes the episode, and returns its index; None without instants."""
     rows, self._rows = self._rows, []
     for row in rows:
       self._writer.add(row)
-    if rows:
-      self._writer.end_episode(self._task, success)
+    if not rows:
+      return None
+    self._writer.end_episode(self._task, success)
+    self._count += 1
+    return self._count - 1
 
 
 def _lerobot() -> Any:

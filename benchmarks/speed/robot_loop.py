@@ -20,7 +20,8 @@ from apnpql_jax.robot.board import PERIOD_BIN_S
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
 from apnpql_jax.robot.devices import Robot
-from apnpql_jax.robot.session import Options, Session
+from apnpql_jax.robot.episodes import Options
+from apnpql_jax.robot.session import Session
 from apnpql_jax.testing import SMALL, export_untrained
 from benchmarks.common import command
 
