@@ -104,9 +104,8 @@ class Player:
   def play(self, order: int, episode: int) -> None:
     """Plays until the order changes, the task is solved or the time is over."""
     self._order, self._solved = order, False
-    self.board["policy"].write(
-      {"order": order, "actions": 0, "missed": 0, "over": 0, "solved": 0}
-    )
+    zeros = dict.fromkeys(("actions", "missed", "over", "solved"), 0)
+    self.board["policy"].write({"order": order, "index": -1, **zeros})
     self._play(episode)
     self.board["policy"].write({"over": 1, "solved": int(self._solved)})
     self.end_episode()

@@ -150,6 +150,7 @@ def test_an_interrupted_episode_is_in_the_log(board, tmp_path):
     episode = Episode(board, frames=4, recorder=recorder)
     with pytest.raises(DeviceError, match="sent no frame"):
       episode.play()
+    assert episode.found["index"] == -1  # As if the process were killed here.
     episode.player.end_episode()
     episode.player.end_episode()  # Once.
   assert (episode.found["ended"], episode.found["index"]) == (1, 0)
