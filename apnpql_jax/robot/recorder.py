@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-import importlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from apnpql_jax.errors import ConfigError, FileError
+from apnpql_jax.data import lerobot
+from apnpql_jax.errors import FileError
 from apnpql_jax.robot.protocols import Frame
 from apnpql_jax.robot.supervisor import CAMERAS
 
@@ -24,7 +24,7 @@ _AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
 
 def check_available() -> None:
   """Raises ``ConfigError`` if logs cannot be written or read."""
-  _lerobot().check_available()
+  lerobot.check_available()
 
 
 def recorded_actions(folder: Path) -> list[np.ndarray]:
@@ -33,7 +33,6 @@ def recorded_actions(folder: Path) -> list[np.ndarray]:
   Raises:
     FileError: It is no log.
   """
-  lerobot = _lerobot()
   episodes = lerobot.read(folder).episodes
   actions = [np.asarray(episode.actions, float) for episode in episodes]
   if not actions or any(x.ndim != 2 or x.shape[1] != 7 for x in actions):
@@ -56,22 +55,21 @@ class Recorder:
       ConfigError: A package is missing.
       FileError: The folder exists or cannot be written.
     """
-    self._lerobot = _lerobot()
     joints = contract["joints"]["state"]
     cameras = contract["cameras"]
     self._task, self._rows, self._count = contract["task"], [], 0
-    self._writer = self._lerobot.Writer(
+    self._writer = lerobot.Writer(
       folder,
       fps=1 / contract["control_period_s"],
       vectors={
-        self._lerobot.STATE: tuple(joints),
-        self._lerobot.ACTION: tuple(contract["action"]["order"]),
+        lerobot.STATE: tuple(joints),
+        lerobot.ACTION: tuple(contract["action"]["order"]),
         _COMMAND: tuple(joints[:6]),
         _WRENCH: _AXES,
         _TIMES: (*CAMERAS, "joints", "gripper", "action"),
       },
       images={
-        f"{self._lerobot.IMAGES}{name}": (
+        f"{lerobot.IMAGES}{name}": (
           cameras[name]["height"],
           cameras[name]["width"],
         )
@@ -107,14 +105,14 @@ class Recorder:
     """
     times = [*(x.time for x in frames), state["time"], state["gripper_time"], now]
     row = {
-      self._lerobot.STATE: np.append(state["position"], state["gripper"]),
-      self._lerobot.ACTION: action,
+      lerobot.STATE: np.append(state["position"], state["gripper"]),
+      lerobot.ACTION: action,
       _COMMAND: state["command"],
       _WRENCH: state["wrench"],
       _TIMES: np.array(times) - begin,
     }
     for name, frame in zip(CAMERAS, frames, strict=True):
-      row[f"{self._lerobot.IMAGES}{name}"] = frame.image
+      row[f"{lerobot.IMAGES}{name}"] = frame.image
     self._rows.append(row)
 
   def end_episode(self, success: bool | None) -> int | None:
@@ -127,12 +125,3 @@ class Recorder:
     self._writer.end_episode(self._task, success)
     self._count += 1
     return self._count - 1
-
-
-def _lerobot() -> Any:
-  try:
-    return importlib.import_module("apnpql_jax.data.lerobot")
-  except ModuleNotFoundError as error:
-    raise ConfigError(
-      f"robot needs {error.name}: pip install 'apnpql-jax[robot]'"
-    ) from error

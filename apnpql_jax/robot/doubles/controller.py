@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from apnpql_jax.robot.doubles.plant import JOINTS, STEP, Plant
+from apnpql_jax.robot.doubles.plant import JOINTS, World
+from apnpql_jax.robot.limits import TIMESTEP
 
 VERSION = (5, 25, 1, 130182)
 SERIAL = "20265500000"
@@ -42,7 +43,7 @@ _SAFETY = {
 class Controller:
   """The state machine between the client's registers and the plant."""
 
-  def __init__(self, plant: Plant, *, model: str = "UR5", remote: bool = True):
+  def __init__(self, plant: World, *, model: str = "UR5", remote: bool = True):
     """Starts with brakes released and without a program.
 
     Args:
@@ -92,7 +93,7 @@ class Controller:
     return {
       **_STANDARD,
       "timestamp": time.monotonic() - self._boot,
-      "actual_execution_time": STEP,
+      "actual_execution_time": TIMESTEP,
       "actual_q": plant.position.tolist(),
       "actual_qd": plant.velocity.tolist(),
       "target_q": plant.target.tolist(),
