@@ -10,6 +10,7 @@ a machine share.
 from __future__ import annotations
 
 from collections.abc import Mapping
+import contextlib
 import enum
 from multiprocessing import shared_memory
 from typing import Any
@@ -194,7 +195,8 @@ def _let_go(
     record.close()
   memory.close()
   if made:
-    memory.unlink()
+    with contextlib.suppress(FileNotFoundError):  # Whoever ends this process may.
+      memory.unlink()
 
 
 def _bytes(line: str) -> bytes:

@@ -25,7 +25,7 @@ from apnpql_jax.robot.player import Act, Player
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.recorder import Recorder, recorded_actions
 
-END_S = 30.0
+END_S = 60.0
 """Time to write an interrupted episode after the end of the control process, s."""
 
 

@@ -124,7 +124,7 @@ def silent_policy(world: World) -> None:
 
 
 def silent_gripper(world: World) -> None:
-  world.gripper_at = world.now - 0.201
+  world.gripper_at = world.now - 0.301
 
 
 def dropped_arm(world: World) -> None:
@@ -148,7 +148,7 @@ FAULTS = {
   "force: above 30 N on the tool": (push(31), Mode.HOLD),
   "force: 51 N on the tool": (push(-51), Mode.STOP),
   "policy: a period late": (silent_policy, Mode.HOLD),
-  "gripper: measurement is 201 ms old": (silent_gripper, Mode.STOP),
+  "gripper: measurement is 301 ms old": (silent_gripper, Mode.STOP),
   f"arm: {LOST}": (dropped_arm, Mode.STOP),
   "policy: its process has ended": (killed_policy, Mode.STOP),
 }
