@@ -95,17 +95,19 @@ class Rig:
 
 
 @contextlib.contextmanager
-def rig() -> Generator[tuple[Board, Rig]]:
-  """Starts a plant, a control process and the policy of this module."""
+def rig(
+  target: Callable[[str, Any, Clock], None] = policy, contract: dict = CONTRACT
+) -> Generator[tuple[Board, Rig]]:
+  """Starts a plant, a control process, and as the policy a function of this module."""
   context = get_context("spawn")
-  robot = Robot("simulated", CONTRACT, Cell(), CLOCK)
+  robot = Robot("simulated", contract, Cell(), CLOCK)
   with simulated.started(robot) as robot, Board() as board:
     receiver, sender = context.Pipe(duplex=False)
     one, other = context.Pipe()
     args = robot, board.name, {"admittance": True}, sender, one
     processes = [
       context.Process(target=control, args=args),
-      context.Process(target=policy, args=(board.name, other, CLOCK)),
+      context.Process(target=target, args=(board.name, other, CLOCK)),
     ]
     for process in processes:
       process.start()
