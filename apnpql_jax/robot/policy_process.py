@@ -89,8 +89,9 @@ def main(robot: Robot, board_name: str, options: dict[str, Any], peer: Pipe) -> 
       an error that ends this process, as text.
   """
   devices.leave_interrupts_to_the_main_process()
-  ending = threading.Event()
-  threading.Thread(target=_end_with, args=(peer, ending), daemon=True).start()
+  ready, ending = threading.Event(), threading.Event()
+  args = peer, ready, ending
+  threading.Thread(target=_end_with, args=args, daemon=True).start()
   board = Board(board_name)
 
   def tell(error: Exception) -> None:
@@ -118,6 +119,7 @@ def main(robot: Robot, board_name: str, options: dict[str, Any], peer: Pipe) -> 
       player = Player(robot, board, cameras, act, recorder, ending)
       stack.callback(player.end_episode)
       board["policy"].write({"ready": 1})
+      ready.set()
       try:
         _serve(player, ending)
       except Exception as error:
@@ -129,12 +131,15 @@ def main(robot: Robot, board_name: str, options: dict[str, Any], peer: Pipe) -> 
     board.close()
 
 
-def _end_with(peer: Pipe, ending: threading.Event) -> None:
-  """Ends this process when the one at the other end has ended."""
+def _end_with(peer: Pipe, ready: threading.Event, ending: threading.Event) -> None:
+  """Ends this process when the one at the other end has ended.
+
+  Before it is ``ready``, there is no episode to write.
+  """
   with contextlib.suppress(EOFError, OSError):
     peer.recv()
   ending.set()
-  time.sleep(END_S)
+  time.sleep(END_S if ready.is_set() else 0.0)
   os._exit(1)
 
 

@@ -122,13 +122,13 @@ class Session(contextlib.AbstractContextManager):
     self._events.clear()
     begin, overruns = self._clock.now(), self._overruns()
     number = self._orders.give(Phase.PLAY)
-    reason = self._follow(number, watch)
+    reason, whole = self._follow(number, watch)
     seconds = self._clock.now() - begin
     policy = self._ended(number)
     self._take_events()
     solved = bool(policy["solved"])
     return Outcome(
-      solved=solved if self._judged and policy["over"] else None,
+      solved=solved if self._judged and whole else None,
       reason=reason or (SOLVED if solved else TIME_LIMIT),
       actions=int(policy["actions"]),
       seconds=seconds,
@@ -186,8 +186,15 @@ class Session(contextlib.AbstractContextManager):
     state, policy = (self.board[x].read() for x in ("state", "policy"))
     return bool(state["time"] and policy["ready"])
 
-  def _follow(self, number: int, watch: Callable[[Any], None] | None) -> str:
-    """Returns why an episode ended before its time; empty if it did not."""
+  def _follow(
+    self, number: int, watch: Callable[[Any], None] | None
+  ) -> tuple[str, bool]:
+    """Waits for the end of an episode.
+
+    Returns:
+      Why it ended before its time, empty if it did not; and false if that was not in
+      the episode itself, but a signal or a failure.
+    """
 
     def over() -> bool:
       policy = self.board["policy"].read()
@@ -199,8 +206,10 @@ class Session(contextlib.AbstractContextManager):
     try:
       self._wait(over, limit * self._clock.slowdown, "the episode to end")
     except (DeviceError, RunStopped) as error:
-      return str(error)
-    return text(self.board["state"].read()["reason"]) if self._orders.done else ""
+      return str(error), False
+    reason = text(self.board["state"].read()["reason"]) if self._orders.done else ""
+    failed = self._running.ended or text(self.board["policy"].read()["error"])
+    return reason, not failed
 
   def _ended(self, number: int) -> Any:
     """Brings the arm to rest; returns the record "policy" once the episode is written.
@@ -224,7 +233,7 @@ class Session(contextlib.AbstractContextManager):
     found = self.board["policy"].read()
     if found["order"] == number:
       return found
-    return dict.fromkeys(("actions", "missed", "solved"), 0) | {"over": 1, "index": -1}
+    return dict.fromkeys(("actions", "missed", "solved"), 0) | {"index": -1}
 
   def _overruns(self) -> int:
     """Returns how many cycles have been late so far."""

@@ -9,7 +9,9 @@ from __future__ import annotations
 from collections.abc import Generator
 import contextlib
 import functools
+from multiprocessing import get_context
 from pathlib import Path
+import threading
 from typing import Any
 from unittest import mock
 
@@ -111,3 +113,22 @@ def test_an_unplugged_camera_stops_the_arm_and_its_episode_is_in_the_log(folder)
   (kept,) = lerobot.read(folder / "log").episodes
   assert len(kept.actions) == found["actions"] == FRAMES
   assert kept.success is None
+
+
+def compiling(peer: Any) -> None:
+  """A policy process that is not ready yet."""
+  never = threading.Event()
+  args = peer, never, threading.Event()
+  threading.Thread(target=policy_process._end_with, args=args, daemon=True).start()
+  never.wait(100.0)
+
+
+def test_a_policy_that_compiles_ends_at_once_with_the_control_process():
+  context = get_context("spawn")
+  ours, theirs = context.Pipe()
+  process = context.Process(target=compiling, args=(theirs,))
+  process.start()
+  theirs.close()
+  ours.close()
+  process.join(policy_process.END_S)
+  assert process.exitcode == 1
