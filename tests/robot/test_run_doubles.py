@@ -102,14 +102,14 @@ def test_a_fault_ends_the_session_with_its_episode_in_the_log(folder, fault):  #
     assert found["exit_code"] == 3 and found["failure"], errors
     kept = episodes(log)
     assert found["reasons"] == [x["reason"] for x in kept]
-    if moving and kept and kept[-1]["reason"].startswith(FAULTS[fault]):
+    hit = [x for x in kept if x["reason"].startswith(FAULTS[fault])]
+    if moving and hit:
       break
     assert not moving or not is_in_time(found), found
   else:
     pytest.skip(f"the machine is too busy: {errors}")
   dataset = lerobot.read(log).episodes
-  assert kept[-1]["dataset_index"] == len(dataset) - 1
-  assert len(dataset[-1].actions) == kept[-1]["actions"] > 0
+  assert len(dataset[hit[0]["dataset_index"]].actions) == hit[0]["actions"] > 0
 
 
 def wait_for_an_action(host: str, process: subprocess.Popen[str]) -> bool:
