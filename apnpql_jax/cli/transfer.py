@@ -14,7 +14,7 @@ from apnpql_jax.cli.commands import (
   existing_run,
   task_env,
 )
-from apnpql_jax.cli.options import File, Flag, OfRun, default_hint
+from apnpql_jax.cli.options import AsTrained, File, Flag, OfRun, default_hint
 from apnpql_jax.errors import ConfigError
 
 EXPERT = "expert"
@@ -24,8 +24,8 @@ EXPERT = "expert"
 class Transfer(OfRun):
   """Plays a policy in another simulator: apnpql transfer RUN [options].
 
-  The scripted expert sees no images. Where it solves less than 95 %, a cell says
-  nothing about a policy.
+  The scripted expert sees no images. Where it solves less than 95 %, a cell is no
+  evidence about a policy.
 
   apnpql transfer runs/mine --renderer opengl --looks unseen
 
@@ -52,13 +52,13 @@ class Transfer(OfRun):
   latency_ms: Annotated[int | None, default_hint("(default: 30)")] = None
   """With bullet: time from the virtual arm to the servos: 0, 30 or 60 ms."""
 
-  admittance: bool = False
+  admittance: Flag = False
   """With bullet: whether the virtual arm yields to the wrench at the tool."""
 
   checkpoint: str = "newest"
   """Checkpoint: newest, best (highest success rate in training) or its step."""
 
-  acting: Annotated[str | None, default_hint("(default: as in training)")] = None
+  acting: AsTrained = None
   """How to choose an action, see `apnpql evaluate --help`."""
 
   episodes: int = 200

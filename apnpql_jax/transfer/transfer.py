@@ -20,7 +20,7 @@ import numpy as np
 
 from apnpql_jax import devices
 from apnpql_jax.config.checks import ACTING
-from apnpql_jax.config.schema import EnvConfig, TrainConfig
+from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.console import reporting
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.envs.state import EnvState
@@ -38,6 +38,7 @@ from apnpql_jax.training.evaluate import (
 )
 from apnpql_jax.transfer import film
 from apnpql_jax.transfer.cell import Cell, Renderer
+from apnpql_jax.transfer.conditions import of_expert, of_run
 from apnpql_jax.transfer.play import Act, Draw, Played, play
 from apnpql_jax.types import Array
 
@@ -87,8 +88,11 @@ def transfer(
   obs = "state" if outside else "pixels"  # Others draw the images.
   env = _make_env(config.env, cell, obs, instants=0 if outside else instants)
   agent, params, step = load_agent(run_dir, config, env.task, step=step)
-  acting = acting or config.eval_acting
-  choose = jax.jit(lambda p, seen, key: agent.act(p, seen, key, acting=acting)[0])
+  conditions = of_run(
+    run_dir, config, step, cell, acting=acting, episodes=episodes, seed=seed
+  )
+  rule = conditions["acting"]
+  choose = jax.jit(lambda p, seen, key: agent.act(p, seen, key, acting=rule)[0])
 
   def act(state: EnvState, seen: Any, key: Array) -> Array:
     del state
@@ -99,8 +103,7 @@ def transfer(
     instants = instants if draw else 0
     played = _play_all(env, cell, act, episodes, seed, draw=draw, instants=instants)
     filmed = _filmed(env, played, video, draw)
-  about = {"checkpoint_step": step, "acting": acting, "trained": _training(config)}
-  return _summary(config.env.task, cell, about, played, began) | filmed
+  return _summary(conditions, played, began) | filmed
 
 
 def transfer_expert(
@@ -130,7 +133,8 @@ def transfer_expert(
   with contextlib.ExitStack() as stack:
     draw = _draw_of(env, cell, stack) if video else None
     filmed = _filmed(env, played, video, draw)
-  found = _summary(env_config.task, cell, {"algorithm": "expert"}, played, began)
+  conditions = of_expert(env_config, cell, episodes=episodes, seed=seed)
+  found = _summary(conditions, played, began)
   return found | filmed | {"sufficient": found["success_rate"] >= EXPERT_SUFFICES}
 
 
@@ -204,25 +208,18 @@ def _play_all(
     ]
 
 
-def _training(config: TrainConfig) -> str:
-  return "randomized" if config.env.randomize else "plain"
-
-
 def _summary(
-  task: str, cell: Cell, about: dict[str, Any], played: list[Played], began: float
+  conditions: dict[str, Any], played: list[Played], began: float
 ) -> dict[str, Any]:
-  episodes = sum(len(x.success) for x in played)
+  """Returns the conditions with the figures; ``began`` is a monotonic time, s."""
   success = np.concatenate([x.success for x in played])
   stages = [stage for x in played for stage in x.stages]
-  solved = int(success.sum())
+  episodes, solved = len(success), int(success.sum())
   failures = Counter(
     end_of(stages[i]) for i in np.flatnonzero(~success) if len(stages[i])
   )
   return {
-    "task": task,
-    **cell.about(),
-    **about,
-    "episodes": episodes,
+    **conditions,
     "successes": solved,
     "success_rate": solved / episodes,
     "ci95": wilson_interval(solved, episodes),
