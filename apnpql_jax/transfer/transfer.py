@@ -27,7 +27,6 @@ from apnpql_jax.envs.state import EnvState
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs import checkpoint_reader, run_folder
 from apnpql_jax.runs.metrics import wilson_interval
-from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.training.diagnose import end_of
 from apnpql_jax.training.evaluate import (
@@ -140,7 +139,6 @@ def transfer_expert(
 
 def make_draw(env: Env, renderer: Renderer) -> Draw:
   """Returns a function that draws all running worlds; others stay black."""
-  poses_of = make_kinematics(env.task.scene)
   sizes = env.config.global_size, env.config.wrist_size
 
   def draw(
@@ -149,7 +147,7 @@ def make_draw(env: Env, renderer: Renderer) -> Draw:
     running: np.ndarray,
     instants: int | np.ndarray,
   ) -> tuple[Array, Array]:
-    kinematics, instants = poses_of(state), np.broadcast_to(instants, len(rows))
+    kinematics, instants = env.poses(state), np.broadcast_to(instants, len(rows))
     poses = {name: np.asarray(getattr(kinematics, name)) for name in _POSES}
     fields = {name: np.asarray(x) for name, x in state.fields.items()}
     images = [np.zeros((len(rows), *size, 3), np.uint8) for size in sizes]
@@ -199,13 +197,16 @@ def _make_env(config: EnvConfig, cell: Cell, obs: str, *, instants: int) -> Env:
 def _play_all(
   env: Env, cell: Cell, act: Act, episodes: int, seed: int, **options: Any
 ) -> list[Played]:
+  """Plays batches of episodes; the last one has no more than are asked for."""
   with contextlib.ExitStack() as stack:
     if worlds := cell.worlds(env):
       options["advance"] = stack.enter_context(worlds).advance
-    return [
+    played = [
       play(env, act, rows, key, **options)
       for rows, key in held_out_batches(env, episodes=episodes, seed=seed)
     ]
+  excess = sum(len(batch.success) for batch in played) - episodes
+  return [*played[:-1], played[-1].without_last(excess)]
 
 
 def _summary(
