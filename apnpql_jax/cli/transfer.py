@@ -85,35 +85,21 @@ def transfer(args: Transfer) -> dict[str, Any]:
   expert = args.run == EXPERT and not Path(EXPERT, "config.json").exists()
   if expert != bool(args.task):
     raise ConfigError("--task names the task of the expert; runs have their own")
-  chosen = (
-    args.physics,
-    args.renderer,
-    args.looks,
-    args.latency_ms,
-    args.admittance,
-  )
   check_free(args.video, overwrite=args.overwrite)
-  common: dict[str, Any] = {
+  env_config = task_env(args.task) if expert else None
+  if env_config is None:
+    existing_run(args.run, "transfer", args.task_file)
+
+  from apnpql_jax.transfer import transfer as playing  # Imports JAX.
+  from apnpql_jax.transfer.cell import Cell
+
+  cell = Cell(args.physics, args.renderer, args.looks, args.latency_ms, args.admittance)
+  options: dict[str, Any] = {
     "episodes": args.episodes,
     "seed": args.seed,
     "video": args.video,
   }
-  if expert:
-    env = task_env(args.task)
-
-    from apnpql_jax.transfer.cell import Cell
-    from apnpql_jax.transfer.transfer import transfer_expert
-
-    return transfer_expert(env, Cell(*chosen), **common)
-  run_dir = existing_run(args.run, "transfer", args.task_file)
-
-  from apnpql_jax.transfer.cell import Cell
-  from apnpql_jax.transfer.transfer import transfer as transfer_run
-
-  return transfer_run(
-    run_dir,
-    Cell(*chosen),
-    step=checkpoint_step(args.run, args.checkpoint),
-    acting=args.acting,
-    **common,
-  )
+  if env_config is not None:
+    return playing.transfer_expert(env_config, cell, **options)
+  step = checkpoint_step(args.run, args.checkpoint)
+  return playing.transfer(args.run, cell, step=step, acting=args.acting, **options)
