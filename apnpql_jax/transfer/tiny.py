@@ -22,6 +22,7 @@ from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.render import Geoms
 from apnpql_jax.sim.scene import Scene
+from apnpql_jax.training.evaluate import MAX_WORLDS
 from apnpql_jax.transfer import looks
 from apnpql_jax.transfer.bullet import connect
 from apnpql_jax.transfer.graphics import (
@@ -34,8 +35,8 @@ from apnpql_jax.transfer.graphics import (
 )
 from apnpql_jax.transfer.shapes import shape
 
-KEPT = 64
-"""Worlds that stay loaded, as many as are played in parallel."""
+KEPT = MAX_WORLDS
+"""Worlds that stay loaded: as many as are played in parallel."""
 
 _NEAR, _FAR = 0.01, 10.0  # m
 _LIGHT_M = 3.0  # m, where the light stands for its shadows

@@ -1,8 +1,8 @@
 """Held-out episodes of a policy or of the expert in worlds that training did not have.
 
 A cell is a choice of physics, renderer and looks. The expert acts on privileged poses,
-so that its success depends on the physics alone. Where it fails, a cell is no evidence
-about a policy.
+so its success depends on the physics alone. Where the expert fails, a cell is no
+evidence about a policy.
 """
 
 from __future__ import annotations
@@ -59,12 +59,20 @@ def transfer(
 ) -> dict[str, Any]:
   """Plays held-out episodes of a cell with a checkpoint of a run.
 
-  ``step`` and ``acting`` are as in ``evaluate``. ``video`` is the file for a video of
-  the first success and the first failure.
+  Args:
+    run_dir: The run folder.
+    cell: The worlds.
+    episodes: Number of episodes.
+    seed: Random seed of the episodes and of the policy.
+    step: Step of the checkpoint; the newest if None.
+    acting: Rule that chooses actions, see ``agents/acting.py``; that of the run's
+      evaluations if None.
+    video: File for a video of the first success and the first failure.
 
   Returns:
-    Success rate with its Wilson interval, and failures by their last stage, as in
-    ``diagnose``.
+    The conditions, see ``conditions.of_run``; the success rate with its Wilson
+    interval; the mean length in control periods; failures by their last stage, as in
+    ``diagnose``; and the time that it took, s.
 
   Raises:
     ConfigError: An argument is invalid, or a package or library is missing.
@@ -168,7 +176,7 @@ def make_draw(env: Env, renderer: Renderer) -> Draw:
 
 def _draw_of(env: Env, cell: Cell, stack: contextlib.ExitStack) -> Draw | None:
   """Returns what draws the images; None if the environment does itself."""
-  outside = cell.renderer_of(env)
+  outside = cell.make_renderer(env)
   return make_draw(env, stack.enter_context(outside)) if outside else None
 
 
@@ -199,7 +207,7 @@ def _play_all(
 ) -> list[Played]:
   """Plays batches of episodes; the last one has no more than are asked for."""
   with contextlib.ExitStack() as stack:
-    if worlds := cell.worlds(env):
+    if worlds := cell.make_worlds(env):
       options["advance"] = stack.enter_context(worlds).advance
     played = [
       play(env, act, rows, key, **options)

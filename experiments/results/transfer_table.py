@@ -25,7 +25,7 @@ from typing import Any
 from apnpql_jax.atomic import replacing
 from apnpql_jax.cli.commands import task_env
 from apnpql_jax.errors import ConfigError, FileError, UserError, one_line
-from apnpql_jax.reports.tables import markdown
+from apnpql_jax.reports.tables import listed, markdown
 from apnpql_jax.runs import checkpoint_reader, run_folder
 from apnpql_jax.transfer import conditions
 from apnpql_jax.transfer.cell import Cell
@@ -50,7 +50,7 @@ CELLS = [
 EXPERT_CELLS = ["native/rays/plain", "bullet/rays/plain"]
 """Cells of the expert, which sees no images."""
 
-HEAD = "run task trained physics renderer looks latency admittance solved 95%"
+HEAD = "run,task,trained,physics,renderer,looks,latency,admittance,solved,95%,failed in"
 """Columns of the table; trained: in plain or randomized worlds."""
 
 MALFORMED = (OSError, ValueError, LookupError, TypeError, AttributeError)
@@ -189,7 +189,7 @@ def play(
 
 def table(results: list[dict[str, Any]]) -> str:
   """Returns the results in Markdown, a row per cell."""
-  rows = [list[str](HEAD.split())]
+  rows = [list[str](HEAD.split(","))]
   rows += [row_of(found) for found in sorted(results, key=order)]
   return markdown(rows) + "\n"
 
@@ -199,6 +199,7 @@ def row_of(found: dict[str, Any]) -> list[str]:
   low, high = (100 * x for x in found["ci95"])
   latency = f"{found['latency_ms']} ms" if "latency_ms" in found else "-"
   admittance = {True: "on", False: "off"}.get(found.get("admittance"), "-")
+  failures = sorted(found["failures"].items(), key=lambda item: -item[1])
   return [
     *(found[name] for name in ("run", "task")),
     found.get("trained", "-"),
@@ -207,6 +208,7 @@ def row_of(found: dict[str, Any]) -> list[str]:
     admittance,
     f"{found['successes']} of {found['episodes']}",
     f"{low:.1f} to {high:.1f} %",
+    listed(f"{stage}: {count}" for stage, count in failures) or "-",
   ]
 
 

@@ -24,7 +24,11 @@ from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
 CONFIG = dataclasses.replace(
   testing.TINY, env=dataclasses.replace(testing.TINY.env, obs="pixels")
 )
-FIGURES = {"successes": 190, "ci95": [0.91, 0.972], "failures": {"to_goal": 10}}
+FIGURES = {
+  "successes": 190,
+  "ci95": [0.91, 0.972],
+  "failures": {"goal": 7, "object": 3},
+}
 
 
 def store(out: Path, who: str, cell: str, **changes: Any) -> Path:
@@ -115,7 +119,7 @@ def test_stored_results_become_a_table_and_are_not_played(
   words = [who, "--cells", cell, "--out", str(tmp_path)]
   shown = run(monkeypatch, capsys, *words)
   row = "| expert | stack_box | - | bullet | rays | plain | 60 ms | on | 190 of 200 |"
-  assert f"{row} 91.0 to 97.2 % |" in shown
+  assert f"{row} 91.0 to 97.2 % | goal: 7, object: 3 |" in shown
   assert (tmp_path / "table.md").read_text() in shown
   with pytest.raises(SystemExit, match="has episodes 200 instead of 50; remove it"):
     run(monkeypatch, capsys, *words, "--episodes", "50")
@@ -190,3 +194,11 @@ def test_errors_of_the_command_end_the_script(tmp_path, monkeypatch, capsys):
   with pytest.raises(SystemExit) as error:
     run(monkeypatch, capsys, *words)
   assert error.value.code == 2 and not list((tmp_path / "out").iterdir())
+
+
+def test_the_documents_have_the_stored_results():
+  found = [transfer_table.read(path) for path in transfer_table.OUT.glob("*.json")]
+  table = transfer_table.table(found)
+  page = (testing.ROOT / "docs" / "transfer.md").read_text()
+  assert len(found) > 0 and table in page
+  assert (transfer_table.OUT / "table.md").read_text() == table
