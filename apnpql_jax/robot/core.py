@@ -73,7 +73,7 @@ class Core:
       virtual.step(action.values[:6], measured, state.wrench)
       # Not the position, whose lead exceeds the limit of acceleration: 1.6 ms later.
       proposed = virtual.velocity
-      limiter.step(proposed, measured, yielding=virtual.contact)
+      limiter.step(proposed, measured, yielding=virtual.share > 0)
       limited = np.abs(limiter.velocity - proposed).max() > _LIMITED
       kept = limiter.velocity if limited else proposed
       virtual.synchronize(limiter.position, kept)
