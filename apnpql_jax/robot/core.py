@@ -66,21 +66,28 @@ class Core:
 
   def step(self, now: float, state: ArmState, action: Action | None) -> Command:
     """Returns the command for the next 2 ms."""
-    limiter, virtual = self.limiter, self.virtual
-    measured = self._measured(now, state)
+    limiter, measured = self.limiter, self._measured(now, state)
     mode, reason = self.supervisor.judge(now, state, action, limiter.position)
     if mode is Mode.FOLLOW and action is not None:
-      virtual.step(action.values[:6], measured, state.wrench)
-      # Not the position, whose lead exceeds the limit of acceleration: 1.6 ms later.
-      proposed = virtual.velocity
-      limiter.step(proposed, measured, yielding=virtual.share > 0)
-      limited = np.abs(limiter.velocity - proposed).max() > _LIMITED
-      kept = limiter.velocity if limited else proposed
-      virtual.synchronize(limiter.position, kept)
+      self._simulate(action.values[:6], measured, state.wrench)
+    elif mode is Mode.HOLD and self.supervisor.pressed and self.virtual.admittance:
+      self._simulate(np.zeros(6), measured, state.wrench)  # The arm gives way.
     else:
       limiter.brake(measured)
-      virtual.synchronize(limiter.position, limiter.velocity)
+      self.virtual.synchronize(limiter.position, limiter.velocity)
     return Command(limiter.position.copy(), mode, reason, limiter.at_rest)
+
+  def _simulate(
+    self, desired: np.ndarray, measured: np.ndarray, wrench: np.ndarray
+  ) -> None:
+    """Moves as the virtual arm does with desired velocities f64[6], if allowed."""
+    limiter, virtual = self.limiter, self.virtual
+    virtual.step(desired, measured, wrench)
+    # Not the position, whose lead exceeds the limit of acceleration: 1.6 ms later.
+    proposed = virtual.velocity
+    limiter.step(proposed, measured, yielding=virtual.share > 0)
+    limited = np.abs(limiter.velocity - proposed).max() > _LIMITED
+    virtual.synchronize(limiter.position, limiter.velocity if limited else proposed)
 
   def move(self, now: float, state: ArmState, target: np.ndarray) -> Command:
     """Returns the command for the next 2 ms on a straight line of joints to a pose."""

@@ -13,7 +13,7 @@ from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.core import Command, Core
 from apnpql_jax.robot.limits import BRAKING, TIMESTEP, Limits
 from apnpql_jax.robot.protocols import ArmState
-from apnpql_jax.robot.supervisor import Action, Mode
+from apnpql_jax.robot.supervisor import JAM_S, Action, Mode
 from apnpql_jax.robot.virtual_arm import LEAD, Admittance, VirtualArm
 
 NEUTRAL = np.array([-1.8957, -1.7712, 1.9888, -1.7884, -1.5708, -0.3249])
@@ -31,10 +31,11 @@ class World:
   """A lagging arm, the core, and a policy that acts every period; time in cycles."""
 
   lag: float = 0.03
+  admittance: Admittance | None = Admittance()
   cycle: int = 0
 
   def __post_init__(self):
-    self.core = Core(LIMITS, model=MODEL, admittance=Admittance())
+    self.core = Core(LIMITS, model=MODEL, admittance=self.admittance)
     self.arm, self.speed, self.wrench = NEUTRAL.copy(), np.zeros(6), np.zeros(6)
     self.action: Action | None = None
     self.measured_at: float | None = None
@@ -73,9 +74,9 @@ class World:
 FAST = np.array([1.0, 0.3, -0.3, 0.2, 0.2, 1.0, 0.0])
 
 
-def moving() -> World:
+def moving(admittance: Admittance | None = Admittance()) -> World:  # noqa: B008
   """Returns a world whose arm moves at nearly 1 rad/s, just after an action."""
-  world = World()
+  world = World(admittance=admittance)
   world.core.start(world.now, world.state())
   world.play(lambda _: FAST, 6 * PERIOD)
   world.act(FAST)
@@ -123,6 +124,7 @@ def killed_policy(world: World) -> None:
   world.core.supervisor.stop("policy: its process has ended")
 
 
+PUSH = push(31)
 FAULTS = {
   "policy: the action is not finite": (nan_action, Mode.HOLD),
   "camera wrist: frame is 101 ms old": (stale_frame, Mode.HOLD),
@@ -130,7 +132,7 @@ FAULTS = {
   "joints: measurement is 21 ms old": (stale_joints, Mode.STOP),
   "arm: a measurement is not finite": (nan_joints, Mode.STOP),
   "arm: a measurement is not finite ": (nan_wrench, Mode.STOP),
-  "force: above 30 N on the tool": (push(31), Mode.HOLD),
+  "force: above 30 N on the tool": (PUSH, Mode.HOLD),
   "force: 51 N on the tool": (push(-51), Mode.STOP),
   "policy: a period late": (silent_policy, Mode.HOLD),
   "policy: its process has ended": (killed_policy, Mode.STOP),
@@ -140,7 +142,8 @@ FAULTS = {
 @pytest.mark.parametrize("reason", FAULTS)
 def test_at_rest_within_half_a_second_of_a_fault_with_its_reason(reason):
   cause, mode = FAULTS[reason]
-  world = moving()
+  # A hold because of a force gives way to it with admittance, see below.
+  world = moving(None if cause is PUSH else Admittance())
   cause(world)
   first = world.step()
   assert first.mode == mode and first.reason == reason.strip()
@@ -237,6 +240,59 @@ def test_a_jam_stops_and_a_hit_only_holds():
   push(35)(world)
   last = world.play(lambda _: FAST, 600)[-1]
   assert (last.mode, last.reason) == (Mode.STOP, "force: 35 N on the tool for 1 s")
+
+
+def pressed_on_a_wall(world: World, stiffness: float, speed: float, seconds: float):
+  """Moves down onto a wall; returns the force (N) and the command of each cycle."""
+  dynamics = MODEL.dynamics(NEUTRAL, np.zeros(6))
+  down = np.linalg.solve(dynamics.tool, [0, 0, -speed, 0, 0, 0])
+  wall, found = MODEL.tool_position(NEUTRAL)[2] - 0.02, []
+  for cycle in range(round(seconds / TIMESTEP)):
+    if cycle % PERIOD == 0:
+      world.act(np.append(down, 0.0))
+    depth = wall - MODEL.tool_position(world.arm)[2]
+    world.wrench = np.array([0, 0, max(0.0, stiffness * depth), 0, 0, 0.0])
+    found.append((world.wrench[2], world.step()))
+  return found
+
+
+def test_a_hold_because_of_a_force_gives_way_to_it():
+  """The force falls below the limit, and the policy has the arm again."""
+  found = pressed_on_a_wall(World(), 1e4, 0.1, 2.0)
+  modes = [command.mode for _, command in found]
+  first = modes.index(Mode.HOLD)
+  follows = modes.index(Mode.FOLLOW, first)
+  assert (follows - first) * TIMESTEP < 0.4 and Mode.STOP not in modes
+  assert min(force for force, _ in found[first:follows]) < 0.5 * LIMITS.hold_force
+  assert max(force for force, _ in found[follows:]) < LIMITS.hold_force
+
+
+def test_without_admittance_a_hold_because_of_a_force_stays_pressed_and_stops():
+  found = pressed_on_a_wall(World(admittance=None), 5e3, 0.05, 3.0)
+  modes = [command.mode for _, command in found]
+  first, stop = modes.index(Mode.HOLD), modes.index(Mode.STOP)
+  assert set(modes[first:stop]) == {Mode.HOLD}
+  assert (stop - first) * TIMESTEP == pytest.approx(JAM_S, abs=0.01)
+  assert min(force for force, _ in found[first:]) > LIMITS.hold_force
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("force", [31.0, -45.0])
+def test_giving_way_is_slow(axis, force):
+  """The tool moves by the felt force over the damping per second, and then stops."""
+  world = moving()
+  world.wrench = force * np.eye(6)[axis]
+  most = abs(force) / Admittance().damping
+  for cycle in range(1, round((JAM_S + 0.3) / TIMESTEP)):
+    command = world.step()
+    if cycle % PERIOD == 0:
+      world.act(FAST)
+    limiter, time = world.core.limiter, cycle * TIMESTEP
+    jacobian = MODEL.dynamics(limiter.position, np.zeros(6)).tool[:3]
+    if time > 0.3:  # It brakes first.
+      assert np.linalg.norm(jacobian @ limiter.velocity) < most
+      assert command.mode is (Mode.HOLD if time < JAM_S - 0.01 else command.mode)
+  assert command.mode is Mode.STOP and command.at_rest
 
 
 def test_no_first_action_holds_then_stops():
