@@ -177,7 +177,8 @@ class Controller:
       if self._phase is Phase.HOME:
         self._gripper.close = bool(order["close"])
       refusal = self._zero.start(self._arm, again=self._phase is Phase.PLAY)
-      self._core.start(self._clock.now(), self._arm.get_observation())
+      goal = self._target if self._phase is Phase.HOME else None
+      self._core.start(self._clock.now(), self._arm.get_observation(), goal)
       self._core.supervisor.stop(refusal)
 
   def _rest(self) -> None:

@@ -58,11 +58,18 @@ class Core:
     self.limiter = MotionLimiter(limits, model.tool_position)
     self.supervisor = Supervisor(limits, 0.0)
 
-  def start(self, now: float, state: ArmState) -> None:
-    """Starts or resumes an episode from the measured joint angles."""
+  def start(
+    self, now: float, state: ArmState, target: np.ndarray | None = None
+  ) -> None:
+    """Begins at the measured joint angles: an episode, or the way to a ``target``.
+
+    The first cycle stops if the arm is outside of its limits, or the way leads out.
+    """
     self.supervisor = Supervisor(self.limits, now)
     self.virtual.reset(state.position)
     self.supervisor.stop(self.limiter.start(state.position))
+    if target is not None:
+      self.supervisor.stop(self.limiter.obstruction(target))
 
   def step(self, now: float, state: ArmState, action: Action | None) -> Command:
     """Returns the command for the next 2 ms."""
@@ -90,13 +97,19 @@ class Core:
     virtual.synchronize(limiter.position, limiter.velocity if limited else proposed)
 
   def move(self, now: float, state: ArmState, target: np.ndarray) -> Command:
-    """Returns the command for the next 2 ms on a straight line of joints to a pose."""
+    """Returns the command for the next 2 ms on a straight line of joints to a pose.
+
+    All joints start and slow down together, so neither the acceleration nor the ranges
+    of single joints bend the line, and a hold does not either. Only an arm that lags by
+    more than ``Limits.deviation`` does; from there, another line leads to the pose.
+    """
     limiter, gap = self.limiter, target - self.limiter.position
     mode, reason = self.supervisor.judge_arm(now, state, limiter.position)
     far = np.abs(gap).max()
     if mode is Mode.FOLLOW and far > _ARRIVED:
       slowing = 0.5 * self.limits.acceleration
-      speed = min(HOME_SPEED, np.sqrt(2 * slowing * far), far / TIMESTEP)
+      speed = np.abs(limiter.velocity).max() + slowing * TIMESTEP
+      speed = min(speed, HOME_SPEED, np.sqrt(2 * slowing * far), far / TIMESTEP)
       limiter.step(gap / far * speed, state.position)
     else:
       limiter.brake(self._measured(now, state))

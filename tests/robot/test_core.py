@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from apnpql_jax.robot.arm_model import ArmModel
-from apnpql_jax.robot.core import Command, Core
+from apnpql_jax.robot.core import HOME_SPEED, Command, Core
 from apnpql_jax.robot.limits import BRAKING, TIMESTEP, Limits
 from apnpql_jax.robot.protocols import ArmState
 from apnpql_jax.robot.supervisor import JAM_S, Action, Mode
@@ -55,7 +55,12 @@ class World:
     self.action = Action(number, self.now, np.asarray(values, float), frames)
 
   def step(self, fault: str = "") -> Command:
-    command = self.core.step(self.now, self.state(fault), self.action)
+    return self.follow(self.core.step(self.now, self.state(fault), self.action))
+
+  def move(self, target: np.ndarray) -> Command:
+    return self.follow(self.core.move(self.now, self.state(), target))
+
+  def follow(self, command: Command) -> Command:
     before = self.arm
     self.arm = before + (TIMESTEP / self.lag) * (command.position - before)
     self.speed = (self.arm - before) / TIMESTEP
@@ -334,6 +339,43 @@ def test_commands_keep_the_limits_for_every_policy_and_contact(seed, lag, noise)
     tool = MODEL.tool_position(command.position)
     assert (tool >= LIMITS.box[:, 0]).all() and (tool <= LIMITS.box[:, 1]).all()
     before = command.position
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_way_home_is_a_straight_line_of_joints(seed):
+  """Also through a hold, which ends where the arm has come to rest."""
+  rng = np.random.default_rng(seed)
+  world = World()
+  world.arm = start = NEUTRAL + np.append(rng.uniform(-0.2, 0.2, 5), 0.4)
+  world.core.start(world.now, world.state(), NEUTRAL)
+  along, speeds, modes = (NEUTRAL - start) / np.linalg.norm(NEUTRAL - start), [], []
+  while not world.core.has_arrived(NEUTRAL):
+    push(35.0 if 400 <= world.cycle < 500 else 0.0)(world)
+    command = world.move(NEUTRAL)
+    modes.append(command.mode)
+    speeds.append(world.core.limiter.velocity)
+    away = command.position - start
+    assert np.abs(away - (away @ along) * along).max() < 1e-9
+    assert world.cycle < 3000
+  assert Mode.HOLD in modes and Mode.STOP not in modes
+  assert np.abs(speeds).max() == pytest.approx(HOME_SPEED, rel=0.1)
+  changes = np.abs(np.diff(speeds, axis=0)).max(axis=1) / TIMESTEP
+  assert (changes <= LIMITS.braking + 1e-6).all()
+  follows = [x is y is Mode.FOLLOW for x, y in zip(modes, modes[1:], strict=False)]
+  # At last it brakes from 0.01 rad/s.
+  assert changes[:-3][follows[:-3]].max() <= LIMITS.acceleration + 1e-6
+
+
+def test_no_way_home_begins_that_leaves_the_box():
+  """The arm would stop halfway."""
+  world = World()
+  over = NEUTRAL.copy()
+  over[0] += 2.5  # The arc of the shoulder leads past the side of the table.
+  world.core.start(world.now, world.state(), over)
+  command = world.move(over)
+  assert command.mode is Mode.STOP and command.at_rest
+  assert "outside the workspace box" in command.reason
+  np.testing.assert_array_equal(command.position, NEUTRAL)
 
 
 def test_free_motion_through_the_limits_is_that_of_the_virtual_arm():
