@@ -51,8 +51,7 @@ def describe(
   outside = MotionLimiter(limits, model.tool_position).start(policy.neutral)
   if outside:
     raise ConfigError(f"{path}: in the neutral pose of the policy {outside}")
-  if kind == "simulated":
-    _check_scene(policy)
+  _check_scene(policy)
   if kind == "ur5e" and not calibrate:
     _check_calibration(robot)
   return robot
@@ -77,8 +76,8 @@ def _check_scene(policy: PolicyFolder) -> None:
   """Checks that the scene of the task is that of the training."""
   from apnpql_jax.tasks import make_task
 
-  task = policy.contract["task"]
-  if make_task(task).scene.fingerprint != policy.contract["origin"]["scene_sha256"]:
+  task, origin = policy.contract["task"], policy.contract.get("origin") or {}
+  if make_task(task).scene.fingerprint != origin.get("scene_sha256"):
     raise ConfigError(
       f"the policy in {policy.path} was trained in another scene of {task}; use the "
       "version of apnpql that trained it"

@@ -176,10 +176,19 @@ def test_what_does_not_fit_the_cell_is_refused(exported, real_cell, capsys):
   assert "in the neutral pose of the policy the tool at" in capsys.readouterr().err
 
 
-def test_another_scene_is_refused(copied, capsys):
-  change(copied, "origin", "scene_sha256", value="0")
-  assert main(["robot", "run", "--policy", str(copied)]) == 2
-  assert "was trained in another scene of push_plate" in capsys.readouterr().err
+@pytest.mark.parametrize("kind", devices.ROBOTS)
+@pytest.mark.parametrize(
+  ("keys", "value"), [(["task"], "stack_box"), (["origin"], {"scene_sha256": "0"})]
+)
+def test_another_scene_is_refused_on_each_robot(
+  copied, real_cell, capsys, kind, keys, value
+):
+  change(copied, *keys, value=value)
+  command = ["robot", "run", "--robot", kind, "--policy", str(copied), "--yes"]
+  assert main([*command, "--cell", str(real_cell)]) == 2
+  task = value if keys == ["task"] else "push_plate"
+  shown = capsys.readouterr().err
+  assert f"was trained in another scene of {task}" in shown and shown.count("\n") == 1
 
 
 def test_a_missing_package_names_the_extra():
