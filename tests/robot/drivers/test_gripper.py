@@ -27,6 +27,7 @@ from apnpql_jax.robot.drivers.rh_p12_rn import (
   OPEN,
   TABLES,
   TICK,
+  Field,
   finger_speed,
   pad_gap,
 )
@@ -92,7 +93,17 @@ def test_only_commands_change_the_gripper(number, bus):
     with held(port) as gripper:
       gripper.send_action(False)
       settle(gripper, 0.0)
-    assert registers(port, number, bus)[torque] == 1
+    after = registers(port, number, bus)
+  assert after[torque] == 1
+  table = TABLES[number]
+
+  def value(field: Field) -> int:
+    return int.from_bytes(after[field.address : field.address + field.size], "little")
+
+  share = value(table.goal_current) / table.largest_current
+  assert share == pytest.approx(driver.CURRENT_SHARE, abs=1e-3)
+  assert value(table.acceleration) == value(table.acceleration_limit) > 0
+  assert value(table.operating_mode) == 5 and value(table.goal_position) == OPEN
 
 
 @pytest.mark.parametrize(("number", "bus"), BUSES)
