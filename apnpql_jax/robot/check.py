@@ -14,6 +14,7 @@ from apnpql_jax.robot import (
   check_devices,
   check_program,
   policy_process,
+  setup,
   simulated,
 )
 from apnpql_jax.robot.arm_model import ArmModel
@@ -38,6 +39,8 @@ def check(
     "cell": str(robot.cell.path or f"that of the {robot.kind} robot"),
     "calibration": str(robot.cell.calibration or "none needed"),
   }
+  with table.row("calibration"):
+    setup.check_calibration(robot)
   act = check_program.rest
   with table.row("program"):  # First, because simulated cameras need JAX set up.
     act, loaded = policy_process.load_program(policy, seed=0), True

@@ -43,7 +43,9 @@ def arm(
     table.rows["arm"] = f"{_text(device)}; measured {1e3 * age:.0f} ms ago"
     for problem in _problems(device, state, age, limits):
       table.fail("arm", problem)
+    force = ", ".join(f"{x:.1f}" for x in model.base_mat @ state.wrench[:3])
     tool = ", ".join(f"{x:.3f}" for x in model.tool_position(state.position))
+    table.rows["force"] = f"({force}) N in the world, before it is zeroed"
     table.rows["tool"] = f"at ({tool}) m, inside the workspace box"
     if outside := MotionLimiter(limits, model.tool_position).start(state.position):
       table.fail("tool", f"{outside}: move the arm by hand")

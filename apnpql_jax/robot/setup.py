@@ -30,7 +30,7 @@ def describe(
   path: Path,
   *,
   slowdown: float = 1.0,
-  calibrate: bool = False,
+  calibrated: bool = True,
 ) -> Robot:
   """Returns the robot of a command.
 
@@ -39,7 +39,7 @@ def describe(
     policy: The policy to run.
     path: File of the cell, for a real arm.
     slowdown: That of a simulated robot's clock.
-    calibrate: The calibration is yet to be made.
+    calibrated: Whether a real arm must have its calibration.
 
   Raises:
     ConfigError: The cell is invalid, has no calibration or that of other cameras, or
@@ -52,8 +52,8 @@ def describe(
   if outside:
     raise ConfigError(f"{path}: in the neutral pose of the policy {outside}")
   _check_scene(policy)
-  if kind == "ur5e" and not calibrate:
-    _check_calibration(robot)
+  if calibrated:
+    check_calibration(robot)
   return robot
 
 
@@ -84,7 +84,15 @@ def _check_scene(policy: PolicyFolder) -> None:
     )
 
 
-def _check_calibration(robot: Robot) -> None:
+def check_calibration(robot: Robot) -> None:
+  """Checks the calibration of a real arm.
+
+  Raises:
+    ConfigError: There is none, or a camera is not where the policy was trained for.
+    FileError: It is damaged or of other cameras.
+  """
+  if robot.kind != "ur5e":
+    return
   path = robot.cell.calibration
   if path is None or not path.is_file():
     raise ConfigError(f"{path} does not exist; make it with apnpql robot calibrate")

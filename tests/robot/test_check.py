@@ -22,6 +22,7 @@ import pytest
 from apnpql_jax.cli.main import main
 from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot import (
+  cell,
   check,
   check_program,
   devices,
@@ -29,6 +30,7 @@ from apnpql_jax.robot import (
   policy_process,
   setup,
 )
+from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.doubles.server import ask
@@ -52,6 +54,7 @@ class Arm:
   position: np.ndarray
   age: float = 0.001
   fault: str = ""
+  wrench: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(6))
 
   def connect(self) -> None: ...
 
@@ -61,9 +64,8 @@ class Arm:
     return {"model": "UR5e", "polyscope": "5.25"}
 
   def get_observation(self) -> ArmState:
-    zero = np.zeros(6)
     when = time.monotonic() - self.age
-    return ArmState(when, self.position, zero, zero, self.fault)
+    return ArmState(when, self.position, np.zeros(6), self.wrench, self.fault)
 
 
 class Gripper(Arm):
@@ -125,7 +127,7 @@ def bench(exported, monkeypatch) -> Bench:
 def test_a_cell_that_is_ready_has_all_rows(bench, capsys):
   found = bench.check()
   assert [*found] == [
-    *("policy", "cell", "calibration", "arm", "tool", "gripper"),
+    *("policy", "cell", "calibration", "arm", "force", "tool", "gripper"),
     *("camera global", "camera wrist", "program", "admittance"),
   ]
   assert found["arm"].startswith("UR5e, polyscope 5.25; measured 1 ms ago")
@@ -220,6 +222,22 @@ def test_a_device_that_is_missing_fails_alone(bench, monkeypatch):
   assert found["gripper"] == "FAILS: gripper: could not open port /dev/nothing"
 
 
+def test_a_real_arm_is_checked_before_its_calibration(bench, tmp_path, monkeypatch):
+  path = tmp_path / "robot.toml"
+  path.write_text(cell.EXAMPLE)
+  robot = setup.describe("ur5e", bench.policy, path, calibrated=False)
+  found = check.check(robot, bench.policy)
+  assert found["not_ready"] == ["calibration"]
+  assert "calibration.json does not exist; make it with" in found["calibration"]
+
+
+def test_the_force_is_shown_in_the_world(bench):
+  """A push from below is along +z, whichever axes the base of the arm has."""
+  up = ArmModel().base_mat.T @ [0.0, 0.0, 12.0]
+  bench.arm.wrench = np.append(up, np.zeros(3))
+  assert bench.check()["force"].replace("-0.0", "0.0").startswith("(0.0, 0.0, 12.0) N")
+
+
 def export_program(
   folder: Path, source: Path, act: Callable[..., jax.Array], platform: str = "cpu"
 ) -> PolicyFolder:
@@ -286,19 +304,26 @@ def double(policy: Path, monkeypatch, **controller: Any) -> Generator[Robot]:
     yield started
 
 
+LOCAL = "the teach pendant has control: switch to remote control"
+SLOW = "the speed slider is at 30%: set it to 100%"
+PROTECTIVE, EMERGENCY = "protective stop: clear the collision", "emergency stop of"
+OTHER = "the arm must be a UR5e, not a UR10"
+PROBLEMS = LOCAL, SLOW, PROTECTIVE, EMERGENCY, OTHER
+
+
 @pytest.mark.parametrize(
   ("controller", "fault", "texts"),
   [
     ({}, "", []),
-    ({"remote": False}, "", ["the teach pendant has control: switch to remote"]),
-    ({"speed_slider": 0.3}, "", ["the speed slider is at 30%: set it to 100%"]),
-    ({}, "protective_stop", ["protective stop: clear the collision"]),
+    ({"remote": False}, "", [LOCAL]),
+    ({"speed_slider": 0.3}, "", [SLOW]),
+    ({}, "protective_stop", [PROTECTIVE]),
     (
-      {"remote": False, "speed_slider": 0.5},
+      {"remote": False, "speed_slider": 0.3},
       "emergency_stop",
-      ["emergency stop", "the teach pendant has control", "slider is at 50%"],
+      [EMERGENCY, LOCAL, SLOW],
     ),
-    ({"model": "UR10"}, "", ["the arm must be a UR5e, not a UR10"]),
+    ({"model": "UR10"}, "", [OTHER]),
   ],
 )
 def test_the_arm_of_a_double_is_only_read(
@@ -311,8 +336,9 @@ def test_the_arm_of_a_double_is_only_read(
     before = ask(host, "state")
     found = check.check(robot, policy_folder.load(exported))
     after = ask(host, "state")
-  assert ("arm" in found.get("not_ready", [])) == bool(texts)
-  assert all(text in found["arm"] for text in texts) and "\n" not in found["arm"]
+  for text in PROBLEMS:
+    assert (text in found["arm"]) == (text in texts), found["arm"]
+  assert not texts or "arm" in found["not_ready"]
   assert before["program_runs"] is after["program_runs"] is False
   assert "gripper" not in found.get("not_ready", [])
   np.testing.assert_allclose(after["position"], before["position"], atol=1e-6)

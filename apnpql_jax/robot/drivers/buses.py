@@ -21,7 +21,7 @@ from typing import Any, Protocol
 from apnpql_jax.errors import DeviceError, one_line
 from apnpql_jax.robot.drivers import vendor
 
-_ATTEMPTS = 3  # without an answer before the gripper counts as lost
+ATTEMPTS = 3  # without an answer, after which the gripper counts as lost
 _ANSWER_S = 0.037  # for one answer by Modbus; the SDK waits as long for four bytes
 _SILENT = "it does not answer: check its power and cable"
 
@@ -85,7 +85,7 @@ class Dynamixel:
 
   def _try(self, call: Callable[..., tuple], *args: Any) -> tuple:
     """Returns what a call of the SDK returns, (..., result, error); tries again."""
-    for _ in range(_ATTEMPTS):
+    for _ in range(ATTEMPTS):
       answer = call(self._port, self._id, *args)
       if answer[-2] == self._success:
         return answer
@@ -134,7 +134,7 @@ class Modbus:
     self._client.close()
 
   def _try(self, call: Callable[..., Any], first: int, *args: Any, **named: Any) -> Any:
-    for _ in range(_ATTEMPTS):
+    for _ in range(ATTEMPTS):
       with contextlib.suppress(self._failure):
         answer = call(first, *args, device_id=self._id, **named)
         if answer.isError():
