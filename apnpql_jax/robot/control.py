@@ -16,6 +16,7 @@ from apnpql_jax.robot.core import Command, Core
 from apnpql_jax.robot.hand import Hand
 from apnpql_jax.robot.protocols import Arm, ArmState
 from apnpql_jax.robot.supervisor import Action, Mode
+from apnpql_jax.robot.zero import Zero
 
 GRIP_S = 3.0
 """Time that the gripper may take to open or close before an episode, s; 1.4 s for all
@@ -45,6 +46,7 @@ class Control:
     self._target, self._closed = np.zeros(6), False
     self._told, self._ending = (Mode.FOLLOW, ""), ""
     self._last, self._periods = 0.0, np.zeros(PERIOD_BINS, int)
+    self._zero = Zero()
     self.at_rest = False
     """Whether the arm follows no commands, and its measured joints stand still."""
 
@@ -62,6 +64,7 @@ class Control:
     self._obey()
     state, now = self._arm.get_observation(), self._clock.now()
     self._note_period(now)
+    self._zero.note(state.wrench)
     self._hand.look(now)
     if self._is_moving:
       self._move(now, state)
@@ -142,8 +145,11 @@ class Control:
     self._done, self._ending, self._told = False, "", (Mode.FOLLOW, "")
     if self._is_moving:
       self._target, self._closed = order["target"].copy(), bool(order["close"])
-      self._arm.start()
-      self._core.start(self._clock.now(), self._arm.get_observation())
+      home = self._phase is Phase.HOME
+      refusal = self._zero.start(self._arm, again=not home)
+      goal = self._target if home else None
+      self._core.start(self._clock.now(), self._arm.get_observation(), goal)
+      self._core.supervisor.stop(refusal)
       self._last = 0.0
 
   def _rest(self) -> None:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from apnpql_jax.data import lerobot
-from apnpql_jax.errors import FileError
 from apnpql_jax.robot.protocols import Frame
 from apnpql_jax.robot.supervisor import CAMERAS
 
@@ -25,19 +24,6 @@ _AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
 def check_available() -> None:
   """Raises ``ConfigError`` if logs cannot be written or read."""
   lerobot.check_available()
-
-
-def recorded_actions(folder: Path) -> list[np.ndarray]:
-  """Returns the actions of each episode of a log, f64[n, 7].
-
-  Raises:
-    FileError: It is no log.
-  """
-  episodes = lerobot.read(folder).episodes
-  actions = [np.asarray(episode.actions, float) for episode in episodes]
-  if not actions or any(x.ndim != 2 or x.shape[1] != 7 for x in actions):
-    raise FileError(f"{str(folder)!r} holds no actions of this arm")
-  return actions
 
 
 class Recorder:

@@ -19,7 +19,7 @@ from apnpql_jax.errors import (
   UserError,
   one_line,
 )
-from apnpql_jax.robot import recorder
+from apnpql_jax.robot import recorder, replay
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.episodes import Options, Outcome
 from apnpql_jax.robot.policy_folder import PolicyFolder
@@ -44,7 +44,7 @@ def run(
 
   Raises:
     ConfigError: A package is missing.
-    FileError: The log exists, or the one to replay is none.
+    FileError: The log exists, or the one to replay is none or not of this policy.
     DeviceError: A device or process has failed before the arm moved.
     RunStopped: SIGINT, SIGTERM or SIGHUP came; with what is known about the arm.
   """
@@ -53,7 +53,7 @@ def run(
     if Path(options.log).exists():
       raise FileError(f"{options.log!r} exists; name another folder with --log")
   if options.replay is not None:
-    recorder.recorded_actions(Path(options.replay))
+    replay.recorded_actions(Path(options.replay), policy.contract)
   outcomes: list[Outcome] = []
   with catching_signals() as caught:
     session = Session(robot, policy, options, caught)

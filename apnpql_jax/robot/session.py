@@ -7,12 +7,14 @@ import contextlib
 import signal
 from typing import Any
 
+import numpy as np
+
 from apnpql_jax.errors import INTERRUPTED, DeviceError, RunStopped
 from apnpql_jax.robot import policy_process, simulated
 from apnpql_jax.robot.board import PERIOD_BIN_S, Board, Phase, text
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.episodes import SOLVED, TIME_LIMIT, Options, Outcome
-from apnpql_jax.robot.limits import TIMESTEP
+from apnpql_jax.robot.limits import TIMESTEP, Limits
 from apnpql_jax.robot.orders import Orders, comes_true
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.processes import Processes
@@ -95,10 +97,15 @@ class Session(contextlib.AbstractContextManager):
   def go_home(self) -> None:
     """Moves the arm to the neutral pose of the policy, and the gripper as it begins.
 
+    A simulated arm that presses on something is freed first, as a person would do.
+
     Raises:
       DeviceError: It cannot get there, or a process has ended.
     """
     policy, wait = self._policy, HOME_S * self._clock.slowdown
+    force = np.linalg.norm(self.board["state"].read()["wrench"][:3])
+    if self._plant is not None and force > Limits.hold_force:
+      self._park(self._plant)
     begin = {"target": policy.neutral, "close": int(policy.begins_closed)}
     self._moved = True
     self._orders.give(Phase.HOME, **begin)
@@ -180,6 +187,15 @@ class Session(contextlib.AbstractContextManager):
     wait = 30.0 * self._clock.slowdown
     self._wait(
       lambda: plant["plant"].read()["scene"] == self._scene, wait, "the objects to rest"
+    )
+
+  def _park(self, plant: Board) -> None:
+    """Puts a simulated arm back where it began."""
+    number = plant["plant"].read()["parked"] + 1
+    plant["scene"].write({"parked": number})
+    wait = 30.0 * self._clock.slowdown
+    self._wait(
+      lambda: plant["plant"].read()["parked"] == number, wait, "the arm to be free"
     )
 
   def _is_ready(self) -> bool:

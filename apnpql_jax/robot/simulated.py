@@ -67,10 +67,10 @@ class SimulatedArm(_OnBoard):
     """See ``Arm.stop``."""
     _opened(self._board)["servo"].write({"follow": 0})
 
-  def start(self) -> None:
+  def start(self, *, zero: bool = True) -> None:
     """See ``Arm.start``."""
     position = self.get_observation().position
-    self._zeroed += 1
+    self._zeroed += zero
     _opened(self._board)["servo"].write(
       {"follow": 1, "target": position, "zero": self._zeroed}
     )

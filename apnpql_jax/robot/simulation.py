@@ -27,6 +27,7 @@ RECORDS = {
   "plant": [
     ("ready", "i8"),
     ("scene", "i8"),
+    ("parked", "i8"),
     ("time", "f8"),
     ("position", "f8", 6),
     ("velocity", "f8", 6),
@@ -39,8 +40,9 @@ RECORDS = {
   ],
   "servo": [("follow", "i8"), ("target", "f8", 6), ("zero", "i8")],
   "grip": [("command", "i8")],
-  # From the main process: the number of the reset state to show.
-  "scene": [("number", "i8"), ("quit", "i8")],
+  # From the main process: the number of the reset state to show, and how often the arm
+  # was to be put back where it began.
+  "scene": [("number", "i8"), ("parked", "i8"), ("quit", "i8")],
 }
 
 OPEN, CLOSE, HOLD = range(3)
@@ -72,6 +74,11 @@ class Scene:
     plant.place(draw.qpos[0], draw.mocap_pos[0], draw.mocap_quat[0])
     return variant
 
+  def park(self, plant: Plant) -> None:
+    """Puts the arm near the neutral pose, as a person would free it."""
+    scene = self._task.scene
+    plant.put_arm(scene.keyframe("neutral")[scene.arm_qpos] + PARKED)
+
   @staticmethod
   def state_of(plant: Plant) -> dict[str, np.ndarray]:
     """Returns the arrays of ``_MOST``, padded."""
@@ -97,7 +104,6 @@ def main(name: str, task_name: str, options: dict[str, Any]) -> None:
     task = tasks.make_task(task_name)
     servo = Servo(latency_s=options["latency_s"])
     plant = Plant(task.scene.model, servo, seed=options["seed"])
-    plant.put_arm(task.scene.keyframe("neutral")[task.scene.arm_qpos] + PARKED)
     scene = Scene(task, seed=options["seed"])
     _run(Simulation(board, plant, scene), options["clock"])
   except Exception as error:  # Shown by the main process, which ends the session.
@@ -111,17 +117,21 @@ class Simulation:
   """A plant behind its board."""
 
   def __init__(self, board: Board, plant: Plant, scene: Scene):
-    """Keeps them; ``scene`` places the objects."""
+    """Keeps them, and parks the arm; ``scene`` places the objects."""
     self._board, self._plant, self._scene = board, plant, scene
-    self._shown = self._zeroed = self._variant = 0
+    self._shown = self._parked = self._zeroed = self._variant = 0
     self._since = 0.0
+    scene.park(plant)
 
   def obey(self, now: float) -> bool:
-    """Places objects and zeroes the sensor as told; returns whether to go on."""
+    """Places objects and arm and zeroes the sensor; returns whether to go on."""
     order, servo = self._board["scene"].read(), self._board["servo"].read()
     if order["number"] != self._shown:
       self._variant = self._scene.place(self._plant)
       self._shown, self._since = int(order["number"]), now
+    if order["parked"] != self._parked:
+      self._parked = int(order["parked"])
+      self._scene.park(self._plant)
     if servo["zero"] != self._zeroed:
       self._zeroed = int(servo["zero"])
       self._plant.zero_force()
@@ -143,6 +153,7 @@ class Simulation:
       {
         "ready": 1,
         "scene": self._shown if now - self._since > _SETTLE_S else 0,
+        "parked": self._parked,
         "time": state.time,
         "position": state.position,
         "velocity": state.velocity,

@@ -22,7 +22,7 @@ from apnpql_jax.robot.hand import THERE_RAD, Hand
 from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.plant import Plant
 from apnpql_jax.robot.protocols import ArmState, GripperState
-from apnpql_jax.robot.simulation import PARKED, RECORDS, Scene, Simulation
+from apnpql_jax.robot.simulation import RECORDS, Scene, Simulation
 from apnpql_jax.robot.supervisor import Mode
 from apnpql_jax.sim import motors
 from apnpql_jax.tasks import make_task
@@ -50,8 +50,8 @@ class Arm(simulated.SimulatedArm):
 
   lost_at = NEVER
 
-  def start(self) -> None:
-    super().start()
+  def start(self, *, zero: bool = True) -> None:
+    super().start(zero=zero)
     TurnedClock.time += 0.01  # The real one waits.
 
   def get_observation(self) -> ArmState:
@@ -82,7 +82,6 @@ class Rig:
   def __init__(self, board: Board, plant_board: Board):
     task = make_task("push_plate")
     self.board, self.plant = board, Plant(task.scene.model)
-    self.plant.put_arm(NEUTRAL + PARKED)
     self.simulation = Simulation(plant_board, self.plant, Scene(task, seed=0))
     self.simulation.publish(TurnedClock.time)
     self.arm, self.gripper = Arm(plant_board.name), Gripper(plant_board.name)

@@ -154,7 +154,7 @@ class UR5e:
     if moves:
       self._open().wait_for_rest()
 
-  def start(self) -> None:
+  def start(self, *, zero: bool = True) -> None:
     """See ``protocols.Arm``; sets the payload first.
 
     Raises:
@@ -162,15 +162,14 @@ class UR5e:
     """
     reports, control = self._open(), self._control
     reports.check()
-    if (share := reports.speed_slider) < 1:
-      raise DeviceError(
-        f"{self._host}: the speed slider is at {share:.0%}: set it to 100%"
-      )
+    if slowed := reports.slowed:
+      raise DeviceError(f"{self._host}: {slowed}")
     if not reports.program_runs:
       self._restart()
     reports.wait_for_rest()
     self._command("payload", control.setPayload, *self._payload)
-    self._command("zero of the force sensor", control.zeroFtSensor)
+    if zero:
+      self._command("zero of the force sensor", control.zeroFtSensor)
     reports.wait_for_news()  # Older measurements have the old zero.
     self._following = True
 

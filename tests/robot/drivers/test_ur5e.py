@@ -101,6 +101,15 @@ def test_start_takes_bias_and_payload_off_the_wrench():
   assert np.linalg.norm(before[:3]) > 2 and np.linalg.norm(after) < 1e-3
 
 
+def test_start_keeps_the_zero_if_asked_to():
+  with doubles.start("push_plate", noise=False) as devices:
+    devices.arm.start(zero=False)
+    assert np.linalg.norm(devices.arm.get_observation().wrench[:3]) > 2
+    devices.arm.stop()
+    devices.arm.start()
+    assert np.linalg.norm(devices.arm.get_observation().wrench) < 1e-3
+
+
 def test_the_table_pushes_the_tool_up(rig):
   position, force = rig.arm.get_observation().position, 0.0
   for _ in range(6000):
@@ -193,6 +202,14 @@ def test_a_controller_that_will_not_do_is_one_line(controller, text):
   ):
     pass
   assert "\n" not in str(error.value)
+
+
+def test_a_slowed_arm_does_not_start():
+  with (
+    doubles.start("push_plate", speed_slider=0.5) as devices,
+    pytest.raises(DeviceError, match="the speed slider is at 50%: set it to 100%"),
+  ):
+    devices.arm.start()
 
 
 def test_describe_names_device_and_versions(rig):
