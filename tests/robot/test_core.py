@@ -11,7 +11,7 @@ import pytest
 
 from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.core import HOME_SPEED, Command, Core
-from apnpql_jax.robot.limits import BRAKING, TIMESTEP, Limits
+from apnpql_jax.robot.limits import BRAKING, TIMESTEP, Limits, MotionLimiter
 from apnpql_jax.robot.protocols import ArmState
 from apnpql_jax.robot.supervisor import JAM_S, Action, Mode
 from apnpql_jax.robot.virtual_arm import LEAD, Admittance, VirtualArm
@@ -32,10 +32,11 @@ class World:
 
   lag: float = 0.03
   admittance: Admittance | None = Admittance()
+  limits: Limits = LIMITS
   cycle: int = 0
 
   def __post_init__(self):
-    self.core = Core(LIMITS, model=MODEL, admittance=self.admittance)
+    self.core = Core(self.limits, model=MODEL, admittance=self.admittance)
     self.arm, self.speed, self.wrench = NEUTRAL.copy(), np.zeros(6), np.zeros(6)
     self.action: Action | None = None
     self.measured_at: float | None = None
@@ -315,30 +316,104 @@ def test_an_arm_that_runs_away_stops():
   assert command.mode is Mode.STOP and "rad from its command" in command.reason
 
 
-@settings(max_examples=10, deadline=None)
-@given(
-  seed=st.integers(0, 2**32 - 1),
-  lag=st.floats(0.002, 0.06),
-  noise=st.sampled_from([0.0, 0.5, 5.0]),
+TIGHT = dataclasses.replace(
+  LIMITS,
+  box=np.array([[0.35, 0.5], [-0.1, 0.1], [0.2, 0.3]]),
+  joints=np.stack([NEUTRAL - 0.3, NEUTRAL + 0.3], axis=1),
 )
-def test_commands_keep_the_limits_for_every_policy_and_contact(seed, lag, noise):
-  """A policy of any numbers, a lagging arm, and wrenches that do not fit the motion."""
-  rng = np.random.default_rng(seed)
-  world = World(lag)
-  world.core.start(world.now, world.state())
-  before = NEUTRAL
-  for cycle in range(20 * PERIOD):
-    if cycle % PERIOD == 0:
-      scale = rng.choice([0.5, 1.0, 1e3, np.nan], p=[0.4, 0.4, 0.15, 0.05])
-      world.act(rng.uniform(-1, 1, 7) * scale)
-    if cycle % 25 == 0:
-      world.wrench = noise * rng.normal(size=6)
-    command = world.step()
-    assert np.abs(command.position - before).max() <= TIMESTEP * (1 + 1e-9)
-    assert np.abs(command.position - world.arm).max() <= LIMITS.deviation * 1.05
-    tool = MODEL.tool_position(command.position)
-    assert (tool >= LIMITS.box[:, 0]).all() and (tool <= LIMITS.box[:, 1]).all()
-    before = command.position
+WIDE = dataclasses.replace(LIMITS, box=np.array([[-2.0, 2.0]] * 3))
+WILD = {"tight": TIGHT, "wide": WIDE}
+
+
+class Anything:
+  """A policy and contacts of any kind, from a seed."""
+
+  def __init__(self, seed: int):
+    self._rng = np.random.default_rng(seed)
+    self._way, self._wrench = np.zeros(6), np.zeros(6)
+
+  def action(self) -> np.ndarray:
+    """Returns an action f64[7]; it often goes on in the same direction."""
+    rng = self._rng
+    if rng.random() < 0.1:
+      self._way = rng.choice([-1, 1], 6) * rng.choice([0.3, 1.0], 6)
+    scale = rng.choice([1.0, 1e3, np.nan, np.inf], p=[0.9, 0.06, 0.02, 0.02])
+    return np.append(self._way * scale, rng.integers(2))
+
+  def wrench(self) -> np.ndarray:
+    """Returns a wrench f64[6] that need not fit the motion."""
+    rng = self._rng
+    if rng.random() < 0.005:
+      size = rng.choice([0.0, 7.0, 20.0, 40.0, 60.0], p=[0.7, 0.1, 0.1, 0.07, 0.03])
+      way = rng.normal(size=6) * np.repeat([1.0, 0.1], 3)
+      self._wrench = size * way / np.linalg.norm(way[:3])
+    return self._wrench + np.repeat([0.5, 0.05], 3) * rng.normal(size=6)
+
+
+@pytest.mark.parametrize("name", WILD)
+def test_commands_keep_the_limits_for_every_policy_and_contact(name):
+  """They use them up, too: each limit, hold and stop occurs."""
+  limits, used, reasons = WILD[name], {}, set()
+
+  @settings(max_examples=8, deadline=None, derandomize=True)
+  @given(seed=st.integers(0, 2**32 - 1), lag=st.sampled_from([0.002, 0.03, 0.08]))
+  def check(seed: int, lag: float) -> None:
+    anything, world = Anything(seed), World(lag, limits=limits)
+    world.core.start(world.now, world.state())
+    stopped = 0
+    for cycle in range(16 * PERIOD):
+      if cycle % PERIOD == 0:
+        world.act(anything.action())
+      world.wrench = anything.wrench()
+      limiter, arm = world.core.limiter, world.arm
+      before, speed = limiter.position, limiter.velocity
+      command = world.step()
+      reasons.add(f"{command.mode.name} {command.reason.partition(':')[0]}")
+      note(used, limiter, before, speed, arm)
+      stopped = stopped + 1 if command.mode is Mode.STOP else 0
+      assert command.at_rest or stopped * TIMESTEP < 0.25
+      if stopped * TIMESTEP > 0.5:
+        assert np.abs(world.speed).max() < REST or lag > 0.03
+        world.core.start(world.now, world.state())
+
+  check()
+  print(name, used, reasons)
+  assert used["acceleration"] > 0.999
+  if name == "wide":
+    assert min(used["velocity"], used["gap"]) > 0.99
+  else:
+    assert min(used["joint"], used["box"]) > 0.95
+  assert {"FOLLOW ", "HOLD force", "HOLD policy", "STOP force"} <= reasons
+
+
+def note(
+  used: dict[str, float],
+  limiter: MotionLimiter,
+  before: np.ndarray,
+  speed: np.ndarray,
+  arm: np.ndarray,
+) -> None:
+  """Checks the command of a cycle, and keeps how much of each limit it has used."""
+  limits, after = limiter.limits, limiter.position
+  gap = np.abs(after - arm).max() / limits.deviation
+  shares = {
+    "velocity": np.abs(after - before).max() / TIMESTEP / limits.velocity,
+    "gap": gap,
+    "joint": share(after, limits.joints),
+    "box": share(MODEL.tool_position(after), limits.box),
+  }
+  if gap < 0.999:  # Else it may follow the arm.
+    change = np.abs(limiter.velocity - speed).max() / TIMESTEP
+    shares["acceleration"] = change / limits.braking
+  for name, value in shares.items():
+    assert value <= 1 + 1e-6, (name, value)
+    used[name] = max(used.get(name, 0.0), value)
+
+
+def share(values: np.ndarray, ranges: np.ndarray) -> float:
+  """Returns the part of the way to the end of a range that the values have gone."""
+  low, high = ranges.T
+  return float((np.abs(2 * values - low - high) / (high - low)).max())
 
 
 @pytest.mark.parametrize("seed", range(4))
