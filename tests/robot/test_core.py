@@ -84,10 +84,10 @@ def moving(admittance: Admittance | None = Admittance()) -> World:  # noqa: B008
   """Returns a world whose arm moves at nearly 1 rad/s, just after an action."""
   world = World(admittance=admittance)
   world.core.start(world.now, world.state())
-  world.play(lambda _: FAST, 6 * PERIOD)
+  world.play(lambda _: FAST, 7 * PERIOD)
   world.act(FAST)
   assert world.step().mode is Mode.FOLLOW
-  assert world.speed.max() > 0.7
+  assert world.speed.max() > 0.95
   return world
 
 
