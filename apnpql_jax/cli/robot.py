@@ -20,7 +20,7 @@ ACTIONS = ("check", "calibrate", "run")
 class Robot(Command):
   """Runs an exported policy on an arm: apnpql robot ACTION [options].
 
-  ACTION is check (nothing moves), calibrate (cameras) or run (plays episodes).
+  ACTION is check (only reads), calibrate (cameras) or run (plays episodes).
 
   apnpql robot check --robot ur5e --policy policy --cell robot.toml
 
@@ -110,7 +110,11 @@ def robot(args: Robot) -> dict[str, Any]:
   policy = policy_folder.load(args.policy)
   setup.check_task(policy, args.task)
   opened = setup.describe(
-    args.robot, policy, args.cell, slowdown=args.slowdown, calibrate=_calibrates(args)
+    args.robot,
+    policy,
+    args.cell,
+    slowdown=args.slowdown,
+    calibrated=args.action == "run",
   )
   if args.action == "calibrate":
     return _calibrate(args, opened)
@@ -159,10 +163,6 @@ def _calibrate(args: Robot, opened: Any) -> dict[str, Any]:
     board_on=args.board_on,
     overwrite=args.overwrite,
   )
-
-
-def _calibrates(args: Robot) -> bool:
-  return args.action == "calibrate"
 
 
 def _check_options(args: Robot) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from apnpql_jax.errors import ConfigError, one_line
 from apnpql_jax.robot.limits import Limits
 from apnpql_jax.robot.virtual_arm import Admittance
+from apnpql_jax.sim.motors import MAX_VELOCITY
 
 EXAMPLE = """\
 calibration = "calibration.json"   # written by apnpql robot calibrate
@@ -36,6 +37,7 @@ high_m = [0.70, 0.35, 0.45]
 """A complete file."""
 
 _JOINT_MARGIN = 0.05  # rad from the end of a joint's range
+_SLOWEST = 0.1  # rad/s, at which the way to the neutral pose ends in time
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +71,9 @@ class Cell:
   workspace_high_m: tuple[float, ...] = (0.75, 0.40, 0.55)
   """Highest position of the tool in the world, m."""
 
+  joint_velocity_rad_per_s: float = MAX_VELOCITY
+  """Limit of each joint's velocity, at most that of the training."""
+
   contact_stiffness_n_per_m: float = Admittance.stiffness
   """Stiffness of the hardest contact to expect, N/m."""
 
@@ -81,6 +86,7 @@ class Cell:
     return Limits(
       box=np.array([self.workspace_low_m, self.workspace_high_m]).T,
       joints=joints + [_JOINT_MARGIN, -_JOINT_MARGIN],
+      velocity=self.joint_velocity_rad_per_s,
       period=contract["control_period_s"],
     )
 
@@ -99,10 +105,14 @@ _KEYS = {
   "cameras.wrist": ("wrist", "text"),
   "workspace.low_m": ("workspace_low_m", "numbers"),
   "workspace.high_m": ("workspace_high_m", "numbers"),
+  "limits.joint_velocity_rad_per_s": ("joint_velocity_rad_per_s", "number"),
   "admittance.contact_stiffness_n_per_m": ("contact_stiffness_n_per_m", "number"),
   "admittance.lag_s": ("lag_s", "number"),
 }
-"""Key -> field (or camera) and kind; those of ``admittance`` are optional."""
+"""Key -> field (or camera) and kind."""
+
+_OPTIONAL = ("limits.", "admittance.")
+"""Beginnings of keys that may be absent."""
 
 _KINDS = {
   "text": "text in quotes",
@@ -132,7 +142,7 @@ def load(path: Path) -> Cell:
   fields: dict[str, Any] = {"path": path, "cameras": {}}
   for key, (field, kind) in _KEYS.items():
     if key not in given:
-      if key.startswith("admittance."):
+      if key.startswith(_OPTIONAL):
         continue
       raise ConfigError(f"{path} has no {key}; add it as {_KINDS[kind]}")
     value = _checked(path, key, kind, given[key])
@@ -142,6 +152,10 @@ def load(path: Path) -> Cell:
   cell = Cell(**fields)
   if not all(np.less(cell.workspace_low_m, cell.workspace_high_m)):
     raise ConfigError(f"{path}: workspace.low_m must be below workspace.high_m")
+  if not _SLOWEST <= cell.joint_velocity_rad_per_s <= MAX_VELOCITY:
+    raise ConfigError(
+      f"{path}: limits.joint_velocity_rad_per_s must be {_SLOWEST} to {MAX_VELOCITY}"
+    )
   if len(set(cell.cameras.values())) < len(cell.cameras):
     raise ConfigError(f"{path}: cameras.global and cameras.wrist are the same camera")
   return cell

@@ -15,7 +15,7 @@ from typing import Any
 from apnpql_jax.errors import ConfigError, UserError, one_line
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
-from apnpql_jax.robot.protocols import Arm, Camera, Gripper
+from apnpql_jax.robot.protocols import Arm, Camera, Device, Gripper
 from apnpql_jax.robot.supervisor import CAMERAS
 
 ROBOTS = ("ur5e", "simulated", "double")
@@ -52,6 +52,30 @@ class Robot:
   """Name of the shared memory of a simulated plant."""
 
 
+def make_arm(robot: Robot, *, reads: bool = False) -> Any:
+  """Returns the arm, not connected; with ``reads``, one that takes no commands."""
+  if robot.kind == "simulated":
+    simulated = importlib.import_module("apnpql_jax.robot.simulated")
+    return simulated.SimulatedArm(robot.plant)
+  cell = robot.cell
+  if reads:
+    listener = importlib.import_module("apnpql_jax.robot.drivers.ur_listener")
+    return listener.Inspector(cell.arm_host)
+  ur5e = importlib.import_module("apnpql_jax.robot.drivers.ur5e")
+  return ur5e.UR5e(
+    cell.arm_host, payload_kg=cell.payload_kg, payload_cog_m=cell.payload_cog_m
+  )
+
+
+def make_gripper(robot: Robot) -> Gripper:
+  """Returns the gripper, not connected."""
+  if robot.kind == "simulated":
+    simulated = importlib.import_module("apnpql_jax.robot.simulated")
+    return simulated.SimulatedGripper(robot.plant)
+  grippers = importlib.import_module("apnpql_jax.robot.drivers.gripper")
+  return grippers.RHP12RN(robot.cell.gripper_port)
+
+
 @contextlib.contextmanager
 def open_arm(robot: Robot) -> Generator[tuple[Arm, Gripper]]:
   """Connects arm and gripper; nothing moves.
@@ -61,22 +85,20 @@ def open_arm(robot: Robot) -> Generator[tuple[Arm, Gripper]]:
     ConfigError: A package is missing.
   """
   with needing_packages(), contextlib.ExitStack() as stack:
-    if robot.kind == "simulated":
-      simulated = importlib.import_module("apnpql_jax.robot.simulated")
-      arm: Arm = simulated.SimulatedArm(robot.plant)
-      gripper: Gripper = simulated.SimulatedGripper(robot.plant)
-    else:
-      ur5e = importlib.import_module("apnpql_jax.robot.drivers.ur5e")
-      grippers = importlib.import_module("apnpql_jax.robot.drivers.gripper")
-      cell = robot.cell
-      arm = ur5e.UR5e(
-        cell.arm_host, payload_kg=cell.payload_kg, payload_cog_m=cell.payload_cog_m
-      )
-      gripper = grippers.RHP12RN(cell.gripper_port)
+    arm, gripper = make_arm(robot), make_gripper(robot)
     for device in (arm, gripper):
-      device.connect()
-      stack.callback(device.disconnect)
+      stack.enter_context(connected(device))
     yield arm, gripper
+
+
+@contextlib.contextmanager
+def connected(device: Device) -> Generator[None]:
+  """Connects a device and disconnects it at the end."""
+  device.connect()
+  try:
+    yield
+  finally:
+    device.disconnect()
 
 
 @contextlib.contextmanager
@@ -102,8 +124,7 @@ def open_cameras(robot: Robot) -> Generator[Sequence[Camera]]:
         for x in CAMERAS
       ]
     for camera in cameras:
-      camera.connect()
-      stack.callback(camera.disconnect)
+      stack.enter_context(connected(camera))
     yield cameras
 
 

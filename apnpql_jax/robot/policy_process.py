@@ -24,7 +24,8 @@ from apnpql_jax.robot.control_process import Pipe
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.protocols import Camera, Frame
-from apnpql_jax.robot.recorder import Recorder, recorded_actions
+from apnpql_jax.robot.recorder import Recorder
+from apnpql_jax.robot.replay import recorded_actions
 
 HISTORY = 3
 """Robot states in an observation."""
@@ -134,7 +135,8 @@ def main(robot: Robot, board_name: str, options: dict[str, Any], peer: Pipe) -> 
     if options["replay"] is None:
       act = load_program(folder, options["seed"])
     else:
-      act = replaying(recorded_actions(Path(options["replay"])))
+      recorded = recorded_actions(Path(options["replay"]), folder.contract)
+      act = replaying(recorded)
     with contextlib.ExitStack() as stack:
       cameras = stack.enter_context(devices.open_cameras(robot))
       recorder = None

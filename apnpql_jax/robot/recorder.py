@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from apnpql_jax.errors import ConfigError, FileError
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.robot.protocols import Frame
 from apnpql_jax.robot.supervisor import CAMERAS
 
@@ -21,21 +21,7 @@ _AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
 
 def check_available() -> None:
   """Raises ``ConfigError`` if logs cannot be written or read."""
-  _lerobot().check_available()
-
-
-def recorded_actions(folder: Path) -> list[np.ndarray]:
-  """Returns the actions of each episode of a log, f64[n, 7].
-
-  Raises:
-    FileError: It is no log.
-  """
-  lerobot = _lerobot()
-  episodes = lerobot.read(folder).episodes
-  actions = [np.asarray(episode.actions, float) for episode in episodes]
-  if not actions or any(x.ndim != 2 or x.shape[1] != 7 for x in actions):
-    raise FileError(f"{str(folder)!r} holds no actions of this arm")
-  return actions
+  lerobot().check_available()
 
 
 class Recorder:
@@ -48,7 +34,7 @@ class Recorder:
       ConfigError: A package is missing.
       FileError: The folder exists or cannot be written.
     """
-    self._lerobot = _lerobot()
+    self._lerobot = lerobot()
     joints = contract["joints"]["state"]
     cameras = contract["cameras"]
     self._task, self._rows = contract["task"], []
@@ -99,7 +85,12 @@ class Recorder:
       self._writer.end_episode(self._task, success)
 
 
-def _lerobot() -> Any:
+def lerobot() -> Any:
+  """Returns the package that reads and writes logs.
+
+  Raises:
+    ConfigError: A package that it needs is missing.
+  """
   try:
     return importlib.import_module("apnpql_jax.data.lerobot")
   except ModuleNotFoundError as error:

@@ -12,7 +12,7 @@ from typing import Any
 
 from apnpql_jax.console import print_line
 from apnpql_jax.errors import DeviceError, FileError
-from apnpql_jax.robot import recorder
+from apnpql_jax.robot import recorder, replay
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.session import Options, Outcome, Session
@@ -35,7 +35,7 @@ def run(
 
   Raises:
     ConfigError: A package is missing.
-    FileError: The log exists, or the one to replay is none.
+    FileError: The log exists, or the one to replay is none or not of this policy.
     DeviceError: A device or process has failed.
     RunStopped: SIGINT, SIGTERM or SIGHUP came; the arm is at rest.
   """
@@ -44,7 +44,7 @@ def run(
     if Path(options.log).exists():
       raise FileError(f"{options.log!r} exists; name another folder with --log")
   if options.replay is not None:
-    recorder.recorded_actions(Path(options.replay))
+    replay.recorded_actions(Path(options.replay), policy.contract)
   outcomes: list[Outcome] = []
   failure = ""
   with contextlib.ExitStack() as stack:

@@ -30,7 +30,7 @@ def describe(
   path: Path,
   *,
   slowdown: float = 1.0,
-  calibrate: bool = False,
+  calibrated: bool = True,
 ) -> Robot:
   """Returns the robot of a command.
 
@@ -39,7 +39,7 @@ def describe(
     policy: The policy to run.
     path: File of the cell, for a real arm.
     slowdown: That of a simulated robot's clock.
-    calibrate: The calibration is yet to be made.
+    calibrated: Whether a real arm must have its calibration.
 
   Raises:
     ConfigError: The cell is invalid, has no calibration or that of other cameras, or
@@ -51,10 +51,9 @@ def describe(
   outside = MotionLimiter(limits, model.tool_position).outside(policy.neutral)
   if outside:
     raise ConfigError(f"{path}: in the neutral pose of the policy {outside}")
-  if kind == "simulated":
-    _check_scene(policy)
-  if kind == "ur5e" and not calibrate:
-    _check_calibration(robot)
+  _check_scene(policy)
+  if calibrated:
+    check_calibration(robot)
   return robot
 
 
@@ -77,15 +76,23 @@ def _check_scene(policy: PolicyFolder) -> None:
   """Checks that the scene of the task is that of the training."""
   from apnpql_jax.tasks import make_task
 
-  task = policy.contract["task"]
-  if make_task(task).scene.fingerprint != policy.contract["origin"]["scene_sha256"]:
+  task, origin = policy.contract["task"], policy.contract.get("origin") or {}
+  if make_task(task).scene.fingerprint != origin.get("scene_sha256"):
     raise ConfigError(
       f"the policy in {policy.path} was trained in another scene of {task}; use the "
       "version of apnpql that trained it"
     )
 
 
-def _check_calibration(robot: Robot) -> None:
+def check_calibration(robot: Robot) -> None:
+  """Checks the calibration of a real arm.
+
+  Raises:
+    ConfigError: There is none, or a camera is not where the policy was trained for.
+    FileError: It is damaged or of other cameras.
+  """
+  if robot.kind != "ur5e":
+    return
   path = robot.cell.calibration
   if path is None or not path.is_file():
     raise ConfigError(f"{path} does not exist; make it with apnpql robot calibrate")

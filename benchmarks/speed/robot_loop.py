@@ -1,11 +1,14 @@
-"""Delays of the actions, and periods of the 500 Hz loop, on the simulated robot.
+"""Delays of the actions, and periods of the 500 Hz loop, without hardware.
 
   python -m benchmarks.speed.robot_loop
   python -m benchmarks.speed.robot_loop --policy policy --actions 200
+  python -m benchmarks.speed.robot_loop --robot double
 
-The delay of an action is the time from the beginning of its control period, with
-both frames drawn on the CPU, until the control process can read it. Only figures of an
-idle machine mean anything: plant, cameras and policy share it with the loop.
+The delay of an action is the time from the beginning of its control period until the
+control process can read it. On the simulated robot, both frames are drawn on the CPU in
+that time. A double's cameras draw at their own rate, and the vendors' clients talk to
+its arm and gripper. Only figures of an idle machine mean anything: plant, cameras and
+policy share it with the loop.
 """
 
 from pathlib import Path
@@ -15,11 +18,8 @@ from typing import Any
 import numpy as np
 
 from apnpql_jax.config import files
-from apnpql_jax.robot import policy_folder
+from apnpql_jax.robot import policy_folder, setup
 from apnpql_jax.robot.board import PERIOD_BIN_S
-from apnpql_jax.robot.cell import Cell
-from apnpql_jax.robot.clock import Clock
-from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.session import Options, Session
 from apnpql_jax.testing import SMALL, export_untrained
 from benchmarks.common import command
@@ -28,6 +28,7 @@ from benchmarks.common import command
 def main() -> None:
   parser = command.parser(__doc__)
   parser.add_argument("--policy", type=Path, help="folder; an untrained one if absent")
+  parser.add_argument("--robot", choices=("simulated", "double"), default="simulated")
   parser.add_argument("--actions", type=int, default=1000)
   parser.add_argument("--slowdown", type=float, default=1.0, help="only to try it")
   args = command.parse(parser)
@@ -37,17 +38,21 @@ def main() -> None:
     if args.policy is None:
       agent = SMALL if args.quick else files.load_preset("push_plate").agent
       export_untrained(path, agent)
-    result = measure(path, actions, args.slowdown)
-  command.publish("robot_loop", args, [result], policy=str(args.policy or "untrained"))
+    result = measure(path, actions, args.robot, args.slowdown)
+  name = "robot_loop" + ("_double" if args.robot == "double" else "")
+  command.publish(name, args, [result], policy=str(args.policy or "untrained"))
 
 
-def measure(path: Path, actions: int, slowdown: float) -> dict[str, Any]:
+def measure(path: Path, actions: int, kind: str, slowdown: float) -> dict[str, Any]:
   """Returns quantiles of the delays (ms) and of the periods (ms)."""
   policy = policy_folder.load(path)
-  robot = Robot("simulated", policy.contract, Cell(), Clock(slowdown))
+  described = setup.describe(kind, policy, Path(), slowdown=slowdown)
   delays: dict[tuple[int, int], float] = {}
   periods, stops = 0, []
-  with Session(robot, policy, Options()) as session:
+  with (
+    setup.doubled(described) as robot,
+    Session(robot, policy, Options()) as session,
+  ):
     session.wait_until_ready()
     while len(delays) < actions:
       session.go_home()
@@ -57,6 +62,7 @@ def measure(path: Path, actions: int, slowdown: float) -> dict[str, Any]:
       stops.append(outcome.reason)
   found = 1e3 * np.array(list(delays.values()))
   return {
+    "robot": kind,
     "actions": len(found),
     "delay_p50_ms": float(np.quantile(found, 0.5)),
     "delay_p99_ms": float(np.quantile(found, 0.99)),

@@ -118,6 +118,12 @@ def test_poses_suffice_as_in_a_recording(tmp_path, env, demos, folder):
   arm = env.task.scene.arm_qpos
   np.testing.assert_allclose(made.qpos[:, arm], demos.qpos[:, arm], atol=1e-5)
   np.testing.assert_allclose(made.mocap_pos, demos.mocap_pos, atol=1e-6)
+  address, _ = env.task.scene.free_joint("plate")
+  plate = slice(address, address + 7)
+  np.testing.assert_allclose(made.qpos[:, plate], demos.qpos[:, plate], atol=1e-5)
+  moved = np.diff(made.qpos[:, arm], axis=0)[~made.first[1:]]
+  driven = made.action[:-1, :6][~made.first[1:]]
+  assert np.corrcoef(moved.ravel(), driven.ravel())[0, 1] > 0.5
 
 
 def test_what_cannot_be_converted_is_named(tmp_path, env, folder):

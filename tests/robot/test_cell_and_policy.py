@@ -15,7 +15,11 @@ from apnpql_jax.cli.main import main
 from apnpql_jax.deploy.export import VERSION
 from apnpql_jax.errors import ConfigError, FileError
 from apnpql_jax.robot import cell, devices, policy_folder
+from apnpql_jax.robot.limits import MotionLimiter
 from apnpql_jax.testing import ROOT, export_untrained
+
+CENTER = np.array([0.5, 0.0, 0.2])
+"""A place inside of the workspace of the example."""
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +110,17 @@ def test_the_example_of_a_cell_is_valid(tmp_path):
   assert limits.period == 0.1
 
 
+def test_a_cell_may_slow_the_arm(tmp_path):
+  path = tmp_path / "robot.toml"
+  path.write_text(cell.EXAMPLE + "[limits]\njoint_velocity_rad_per_s = 0.3\n")
+  contract = {"joints": {"ranges": [[-7, 7]] * 7}, "control_period_s": 0.15}
+  limiter = MotionLimiter(cell.load(path).limits(contract), lambda joints: CENTER)
+  limiter.start(np.zeros(6))
+  for _ in range(1000):
+    limiter.step(np.ones(6), limiter.position)
+  np.testing.assert_allclose(limiter.velocity, 0.3)
+
+
 def test_the_page_shows_the_example():
   page = (ROOT / "docs" / "robot.md").read_text(encoding="utf-8")
   assert f"```toml\n{cell.EXAMPLE}```" in page
@@ -124,6 +139,7 @@ def test_the_page_shows_the_example():
     ("[0.25, -0.35, 0.005]", "[0.9, 0, 0]", "low_m must be below"),
     ("210987654321", "123456789012", "are the same camera"),
     ("[arm]", "[arm", "cannot be read"),
+    ("[gripper]", "[limits]\njoint_velocity_rad_per_s = 2\n[gripper]", "be 0.1 to 1"),
   ],
 )
 def test_bad_cells_name_the_key_and_the_cure(tmp_path, old, new, message):
@@ -176,10 +192,19 @@ def test_what_does_not_fit_the_cell_is_refused(exported, real_cell, capsys):
   assert "in the neutral pose of the policy the tool at" in capsys.readouterr().err
 
 
-def test_another_scene_is_refused(copied, capsys):
-  change(copied, "origin", "scene_sha256", value="0")
-  assert main(["robot", "run", "--policy", str(copied)]) == 2
-  assert "was trained in another scene of push_plate" in capsys.readouterr().err
+@pytest.mark.parametrize("kind", devices.ROBOTS)
+@pytest.mark.parametrize(
+  ("keys", "value"), [(["task"], "stack_box"), (["origin"], {"scene_sha256": "0"})]
+)
+def test_another_scene_is_refused_on_each_robot(
+  copied, real_cell, capsys, kind, keys, value
+):
+  change(copied, *keys, value=value)
+  command = ["robot", "run", "--robot", kind, "--policy", str(copied), "--yes"]
+  assert main([*command, "--cell", str(real_cell)]) == 2
+  task = value if keys == ["task"] else "push_plate"
+  shown = capsys.readouterr().err
+  assert f"was trained in another scene of {task}" in shown and shown.count("\n") == 1
 
 
 def test_a_missing_package_names_the_extra():
@@ -191,7 +216,7 @@ def test_a_missing_package_names_the_extra():
 
 
 def test_a_real_arm_does_not_move_unasked(exported, real_cell, capsys, monkeypatch):
-  monkeypatch.setattr("apnpql_jax.robot.setup._check_calibration", lambda robot: None)
+  monkeypatch.setattr("apnpql_jax.robot.setup.check_calibration", lambda robot: None)
   command = ["robot", "run", "--robot", "ur5e", "--policy", str(exported)]
   assert main([*command, "--cell", str(real_cell)]) == 2
   assert "a real arm would move; add --yes" in capsys.readouterr().err

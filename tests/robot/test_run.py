@@ -42,7 +42,8 @@ def output(*args: str, cwd: Path) -> tuple[str, str]:
 
 def is_orderly(reason: str) -> bool:
   """Returns whether an untrained policy may end an episode so."""
-  return reason == "time limit" or reason.startswith(("force: ", "arm: ", "policy: "))
+  late = "policy: two periods late"  # On a busy machine.
+  return reason in ("time limit", late) or reason.startswith(("force: ", "arm: "))
 
 
 @pytest.fixture(scope="module")
@@ -83,10 +84,13 @@ def test_an_untrained_policy_plays_its_episodes_in_order(folder):
   assert len(first.actions) == kept[0]["actions"]
   assert np.abs(first.actions[:, :6]).max() <= 1
 
-  shown, _ = output(
-    *args[:-3], "--episodes", "1", "--replay", "log", "--json", cwd=folder
-  )
+  once = *args[:-3], "--episodes", "1", "--json", "--log", "again"
+  shown, _ = output(*once, "--replay", "log", cwd=folder)
   assert is_orderly(json.loads(shown)["reasons"][0])
+  repeated = lerobot.read(folder / "again").episodes[0].actions
+  count = min(len(repeated), len(first.actions))
+  assert count
+  np.testing.assert_array_equal(repeated[:count], first.actions[:count])
 
 
 @pytest.mark.slow

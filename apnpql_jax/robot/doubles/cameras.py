@@ -25,7 +25,7 @@ SIZE = 240, 424  # a mode of both cameras
 MODELS = {"global": ("D455", 90.0), "wrist": ("D435", 69.8)}
 """Camera of the contract -> model and horizontal field of view, degrees."""
 
-_PERIOD = 1 / 15  # s between two frames, which software renders
+_PERIOD = 1 / 15  # s between two frames at least, as software renders them
 _EXTENSION = "Intel RealSense "
 
 
@@ -100,7 +100,9 @@ def cameras(
 
   def run() -> None:
     with contextlib.suppress(DeviceError):  # The doubles may end first.
-      while not end.wait(_PERIOD):
+      begin = time.monotonic()
+      while not end.wait(max(0.0, begin + _PERIOD - time.monotonic())):
+        begin = time.monotonic()
         when, state = time.time(), ask(host, "state")
         if state["cameras"]:
           for device, image in zip(devices.values(), renderer.ask(state), strict=True):

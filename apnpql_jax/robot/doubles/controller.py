@@ -25,7 +25,6 @@ _RUNNING, _STOPPED = 2, 1  # runtime_state
 _STANDARD = {
   "robot_mode": 7,
   "speed_scaling": 1.0,
-  "target_speed_fraction": 1.0,
   "actual_main_voltage": 48.0,
   "actual_robot_voltage": 48.0,
   "joint_temperatures": [30.0] * 6,
@@ -42,15 +41,24 @@ _SAFETY = {
 class Controller:
   """The state machine between the client's registers and the plant."""
 
-  def __init__(self, plant: Plant, *, model: str = "UR5", remote: bool = True):
+  def __init__(
+    self,
+    plant: Plant,
+    *,
+    model: str = "UR5",
+    remote: bool = True,
+    speed_slider: float = 1.0,
+  ):
     """Starts with brakes released and without a program.
 
     Args:
       plant: What it drives.
       model: Name in the dashboard; that of a UR5e is "UR5".
       remote: Whether the teach pendant gave control away.
+      speed_slider: Its position on the teach pendant, 0 to 1.
     """
     self.plant, self.model, self.remote = plant, model, remote
+    self._slider = speed_slider
     self.safety, self.running = "NORMAL", False
     self._boot = time.monotonic()
     self._inputs: dict[str, float] = {}
@@ -93,6 +101,7 @@ class Controller:
       **_STANDARD,
       "timestamp": time.monotonic() - self._boot,
       "actual_execution_time": STEP,
+      "target_speed_fraction": self._slider,
       "actual_q": plant.position.tolist(),
       "actual_qd": plant.velocity.tolist(),
       "target_q": plant.target.tolist(),

@@ -175,7 +175,7 @@ class Remote:
     self, plant: Plant, controller: Controller, gripper: Gripper, server: Server
   ):
     """Keeps what it acts on."""
-    self._plant, self._gripper = plant, gripper
+    self._plant, self._gripper, self._controller = plant, gripper, controller
     self.protective_stop = controller.protective_stop
     self.emergency_stop = controller.emergency_stop
     self.stop_program = controller.stop_program
@@ -201,6 +201,7 @@ class Remote:
       "position": plant.position.tolist(),
       "target": plant.target.tolist(),
       "finger": plant.finger,
+      "program_runs": self._controller.running,
       "qpos": data.qpos.tolist(),
       "mocap_pos": data.mocap_pos.tolist(),
       "mocap_quat": data.mocap_quat.tolist(),

@@ -4,6 +4,11 @@ An RH-P12-RN(A) speaks either, as its Protocol Type(13) says. The manufacturer d
 publish the registers of Modbus. Those who use it (the project
 ``Doosan-E0509-ROBOTIS-RH-P12-RN-TCP-Bridge`` on GitHub) find the bytes of addresses 2n
 and 2n + 1 of the control table in register n, low byte first.
+
+At 57,600 baud, the 29 bytes of a reading of four bytes take 5 ms, the gripper waits up
+to 0.5 ms before it answers, and a USB adapter by FTDI hands bytes over every 16 ms
+unless its latency timer is set lower. So an answer arrives within 22 ms. Both buses
+wait about 37 ms for it and try three times: a silent line is an error within 0.12 s.
 """
 
 from __future__ import annotations
@@ -11,14 +16,13 @@ from __future__ import annotations
 from collections.abc import Callable
 import contextlib
 import importlib
-import time
 from typing import Any, Protocol
 
 from apnpql_jax.errors import DeviceError, one_line
 from apnpql_jax.robot.drivers import vendor
 
-_PATIENCE = 0.5  # s without an answer before the gripper counts as lost
-_ATTEMPT = 0.05  # s for one answer by Modbus; the SDK has a similar limit
+ATTEMPTS = 3  # without an answer, after which the gripper counts as lost
+_ANSWER_S = 0.037  # for one answer by Modbus; the SDK waits as long for four bytes
 _SILENT = "it does not answer: check its power and cable"
 
 
@@ -81,8 +85,7 @@ class Dynamixel:
 
   def _try(self, call: Callable[..., tuple], *args: Any) -> tuple:
     """Returns what a call of the SDK returns, (..., result, error); tries again."""
-    end = time.monotonic() + _PATIENCE
-    while time.monotonic() < end:
+    for _ in range(ATTEMPTS):
       answer = call(self._port, self._id, *args)
       if answer[-2] == self._success:
         return answer
@@ -104,7 +107,7 @@ class Modbus:
     client = vendor("pymodbus.client", "pymodbus").ModbusSerialClient
     self._failure = importlib.import_module("pymodbus.exceptions").ModbusException
     self._where, self._id = port, device_id
-    self._client = client(port, baudrate=baud, timeout=_ATTEMPT, retries=0)
+    self._client = client(port, baudrate=baud, timeout=_ANSWER_S, retries=0)
     if not self._client.connect():
       raise DeviceError(f"could not open port {port}")
 
@@ -131,8 +134,7 @@ class Modbus:
     self._client.close()
 
   def _try(self, call: Callable[..., Any], first: int, *args: Any, **named: Any) -> Any:
-    end = time.monotonic() + _PATIENCE
-    while time.monotonic() < end:
+    for _ in range(ATTEMPTS):
       with contextlib.suppress(self._failure):
         answer = call(first, *args, device_id=self._id, **named)
         if answer.isError():

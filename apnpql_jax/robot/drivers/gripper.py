@@ -1,13 +1,13 @@
 """The grippers RH-P12-RN and RH-P12-RN(A), by Dynamixel protocol 2.0 or Modbus-RTU.
 
-The bus is slow (one reading takes about 10 ms at 57,600 baud), so a thread reads the
-finger's angle and writes commands. While the fingers move, it adapts their velocity to
-their angle, so that the gap changes at the constant speed of the training.
+The bus is slow (see ``buses``), so a thread reads the finger's angle and writes
+commands. While the fingers move, it adapts their velocity to their angle, so that the
+gap changes at the constant speed of the training. ``connect`` only reads. Mode, current
+and torque go out with the first command.
 """
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from typing import Any
@@ -23,7 +23,6 @@ from apnpql_jax.robot.drivers.rh_p12_rn import (
   TICK,
   Field,
   Table,
-  finger_speed,
   torque,
 )
 from apnpql_jax.robot.protocols import GripperState
@@ -35,7 +34,6 @@ CURRENT_SHARE = GRIPPER_TORQUE / torque(1.0)
 
 _PERIOD = 0.005  # s between two readings at least
 _ERROR_PERIOD = 0.5  # s between two readings of the hardware error status
-_REVOLUTION = 2 * math.pi / 60  # rad/s per rev/min
 
 
 def connect(port: str, **settings: Any) -> RHP12RN:
@@ -80,17 +78,22 @@ class RHP12RN:
     self._goal: int | None = None
 
   def connect(self) -> None:
-    """See ``protocols.Device``; identifies the model. Harmless if it is connected.
+    """See ``protocols.Device``; identifies the model, and writes nothing.
+
+    Harmless if it is connected.
 
     Raises:
-      DeviceError: The port cannot be opened, nothing answers, or another device does.
+      DeviceError: The port cannot be opened, nothing answers, another device does, or
+        the gripper reports an error.
     """
     if self._thread:
       return
     self._goal, self._error = None, ""
     try:
       self._bus, self._table = self._identify()
-      self._prepare(self._table)
+      self._fastest = self._read(self._table.velocity_limit)
+      self._about = self._describe(self._table)
+      self._check_hardware()
       self._state = self._read_state()
     except DeviceError as error:
       self._close()
@@ -168,27 +171,32 @@ class RHP12RN:
     if bus:
       bus.close()
 
-  def _prepare(self, table: Table) -> None:
-    """Sets mode, current and acceleration; the fingers stay where they are."""
-    if self._read(table.operating_mode) != POSITION_MODE:
-      self._write(table.torque_enable, 0)
-      self._write(table.operating_mode, POSITION_MODE)
-    current = round(self._share * table.largest_current)
-    self._fastest = self._read(table.velocity_limit)
-    # A profile with acceleration is the only one whose velocity can change on the way.
-    self._write(table.acceleration, self._read(table.acceleration_limit))
-    self._write(table.goal_current, min(current, self._read(table.current_limit)))
-    here = min(max(self._ticks(), OPEN), CLOSED)  # It refuses a goal beyond its range.
-    self._command(here, self._velocity(0.0))
-    self._write(table.torque_enable, 1)
-    self._about = {
+  def _describe(self, table: Table) -> dict[str, Any]:
+    return {
       "model": table.name,
       "model_number": table.model_number,
       "firmware": self._read(table.firmware),
       "bus": self._open_bus().name,
       "id": self._id,
-      "current_ma": current * table.milliamperes,
+      "current_ma": self._current(table) * table.milliamperes,
     }
+
+  def _current(self, table: Table) -> int:
+    """Returns the current to set, in the gripper's unit."""
+    return min(table.current(self._share), self._read(table.current_limit))
+
+  def _prepare(self) -> None:
+    """Sets mode, current, acceleration and torque; the fingers stay where they are."""
+    assert (table := self._table)
+    if self._read(table.operating_mode) != POSITION_MODE:
+      self._write(table.torque_enable, 0)
+      self._write(table.operating_mode, POSITION_MODE)
+    # A profile with acceleration is the only one whose velocity can change on the way.
+    self._write(table.acceleration, self._read(table.acceleration_limit))
+    self._write(table.goal_current, self._current(table))
+    here = min(max(self._ticks(), OPEN), CLOSED)  # It refuses a goal beyond its range.
+    self._command(here, self._velocity(0.0))
+    self._write(table.torque_enable, 1)
 
   def _serve(self) -> None:
     """Reads and commands until the end; an error stays until the next ``connect``."""
@@ -202,6 +210,8 @@ class RHP12RN:
           asked = state.time
           self._check_hardware()
         if (goal := self._goal) is not None:
+          if done is None:
+            self._prepare()
           wanted = goal, self._velocity(state.angle)
           if wanted != done:
             self._command(*wanted)
@@ -213,8 +223,7 @@ class RHP12RN:
   def _velocity(self, angle: float) -> int:
     """Returns the velocity of the profile at an angle, in the gripper's unit."""
     assert self._table
-    speed = finger_speed(min(max(angle, 0.0), CLOSED * TICK))
-    return min(round(speed / (self._table.rpm * _REVOLUTION)), self._fastest)
+    return min(self._table.speed(angle), self._fastest)
 
   def _command(self, goal: int, velocity: int) -> None:
     """Writes goal and velocity, which lie next to each other, in one packet."""

@@ -18,6 +18,7 @@ from apnpql_jax.sim.motors import FINGER_ANGLE, FINGER_LENGTH, GRIPPER_SPEED
 TICK = 2 * math.pi / 4096  # rad
 OPEN, CLOSED = 0, 740  # ticks
 PAD_OFFSET = 0.0041  # m, as in the contract's ``pad_gap_m``
+_RPM = 2 * math.pi / 60  # rad/s
 MAX_FORCE = 170.0  # N at the largest current, data sheet
 
 ERRORS = {
@@ -59,6 +60,15 @@ class Table:
   hardware_error: Field
   operating_mode: Field = Field(11, 1)
   firmware: Field = Field(6, 1)
+
+  def speed(self, angle: float) -> int:
+    """Returns ``finger_speed`` at an angle (rad, clipped) in units of velocities."""
+    inside = min(max(angle, OPEN * TICK), CLOSED * TICK)
+    return round(finger_speed(inside) / (self.rpm * _RPM))
+
+  def current(self, share: float) -> int:
+    """Returns a share of the largest current in units of currents."""
+    return round(share * self.largest_current)
 
 
 POSITION_MODE = 5  # "current-based position control"

@@ -159,10 +159,8 @@ class UR5e:
     """
     reports, control = self._open(), self._control
     reports.check()
-    if (share := reports.speed_slider) < 1:
-      raise DeviceError(
-        f"{self._host}: the speed slider is at {share:.0%}: set it to 100%"
-      )
+    if slowed := reports.slowed:
+      raise DeviceError(f"{self._host}: {slowed}")
     if not reports.program_runs:
       self._restart()
     reports.wait_for_rest()

@@ -21,16 +21,30 @@ _HELLO = struct.pack(">HBH", 5, ord("V"), 2)  # asks for version 2 of RTDE
 _WELCOME = struct.pack(">HB?", 4, ord("V"), True)
 
 
+LOCAL = "the teach pendant has control: switch to remote control there"
+
+
 def check_controller(host: str, dashboard_client: Any) -> dict[str, Any]:
-  """Returns model, serial number and version of the UR5e at ``host``.
+  """Returns model, serial number and version of the UR5e at ``host``; see ``identify``.
+
+  Raises:
+    DeviceError: See ``identify``; or the teach pendant has control.
+  """
+  about, remote = identify(host, dashboard_client)
+  if not remote:
+    raise DeviceError(f"{host}: {LOCAL}")
+  return about
+
+
+def identify(host: str, dashboard_client: Any) -> tuple[dict[str, Any], bool]:
+  """Returns what the UR5e at ``host`` is, and whether it is in remote control.
 
   Args:
     host: Address of the controller.
     dashboard_client: The module of ``ur_rtde``.
 
   Raises:
-    DeviceError: Nothing answers there, or something that is not a UR5e, or the teach
-      pendant has control.
+    DeviceError: Nothing answers there, or something that is not a UR5e.
   """
   check_rtde(host)
   about, remote = _ask_dashboard(host, dashboard_client)
@@ -41,11 +55,7 @@ def check_controller(host: str, dashboard_client: Any) -> dict[str, Any]:
     raise DeviceError(f"{host}: the arm must be a UR5e, not a {what}")
   if version < _OLDEST:
     raise DeviceError(f"{host}: PolyScope {about['polyscope']} is older than 5.6")
-  if not remote:
-    raise DeviceError(
-      f"{host}: the teach pendant has control: switch to remote control there"
-    )
-  return {**about, "model": "UR5e"}
+  return {**about, "model": "UR5e"}, remote
 
 
 def check_rtde(host: str) -> None:

@@ -1,4 +1,4 @@
-"""A UR controller that is only read, while the teach pendant has control."""
+"""A UR controller that is only read: in free drive, or before a run."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 from apnpql_jax.errors import DeviceError, one_line
 from apnpql_jax.robot.drivers import vendor
-from apnpql_jax.robot.drivers.ur_check import check_rtde
+from apnpql_jax.robot.drivers.ur_check import LOCAL, check_rtde, identify
 from apnpql_jax.robot.drivers.ur_state import CYCLE, VARIABLES, Reports
 from apnpql_jax.robot.protocols import ArmState
 
@@ -55,3 +55,31 @@ class Listener:
     if self._reports is None or not self._reports.connected:
       raise DeviceError(f"{self._host}: lost the connection: check network and power")
     return self._reports.measure(following=False)
+
+
+class Inspector(Listener):
+  """An arm before a run: what it is, and what would keep it from following."""
+
+  _about: dict[str, Any] | None = None
+  _remote = False
+
+  def connect(self) -> None:
+    """See ``protocols.Device``; sends no program, unlike the arm of a run.
+
+    Raises:
+      DeviceError: Nothing answers, or it is not a UR5e.
+    """
+    dashboard = vendor("dashboard_client", "ur_rtde")
+    self._about, self._remote = identify(self._host, dashboard)
+    super().connect()
+
+  def describe(self) -> dict[str, Any]:
+    """See ``protocols.Device``."""
+    return dict(self._about or {})
+
+  def problems(self) -> list[str]:
+    """Returns what is to be changed at the teach pendant, besides faults."""
+    found = [] if self._remote else [LOCAL]
+    if self._reports is not None and (slowed := self._reports.slowed):
+      found.append(slowed)
+    return found

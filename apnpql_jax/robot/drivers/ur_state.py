@@ -54,9 +54,10 @@ class Reports:
     return bool(self._source.getRobotStatus() & _PROGRAM_RUNS)
 
   @property
-  def speed_slider(self) -> float:
-    """The share of its speed at which the program runs."""
-    return self._source.getTargetSpeedFraction()
+  def slowed(self) -> str:
+    """Why the arm would follow its targets too slowly, or an empty string."""
+    share = self._source.getTargetSpeedFraction()
+    return "" if share >= 1 else f"the speed slider is at {share:.0%}: set it to 100%"
 
   def measure(self, *, following: bool) -> ArmState:
     """Returns the newest measurement; see ``fault``."""

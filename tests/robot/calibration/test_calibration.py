@@ -400,9 +400,10 @@ def test_a_reader_refuses_what_is_missing_or_of_other_cameras(
   moved["global"]["pose_in_world"]["position_m"] = ["a"]
   changed(cameras=moved)
   refused("is damaged")
-  moved["global"]["lens"]["fx"] = float("nan")
-  changed(cameras=moved)
-  refused("a lens has impossible numbers|is damaged")
+  blind = copy.deepcopy(value["cameras"])
+  blind["global"]["lens"]["fx"] = float("nan")
+  changed(cameras=blind)
+  refused("a lens has impossible numbers")
   written.write_text("{")
   refused("is damaged")
 

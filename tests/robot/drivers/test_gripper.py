@@ -21,12 +21,21 @@ from apnpql_jax.robot import doubles
 from apnpql_jax.robot.doubles.dynamixel import crc
 from apnpql_jax.robot.doubles.modbus import crc as modbus_crc
 from apnpql_jax.robot.doubles.server import ask
-from apnpql_jax.robot.drivers import gripper as driver
-from apnpql_jax.robot.drivers.rh_p12_rn import CLOSED, OPEN, TICK, finger_speed, pad_gap
+from apnpql_jax.robot.drivers import buses, gripper as driver
+from apnpql_jax.robot.drivers.rh_p12_rn import (
+  CLOSED,
+  OPEN,
+  TABLES,
+  TICK,
+  Field,
+  finger_speed,
+  pad_gap,
+)
 
 sdk = pytest.importorskip("dynamixel_sdk", reason="needs dynamixel-sdk")
 
 MODELS = {35073: "RH-P12-RN", 35074: "RH-P12-RN(A)"}
+BUSES = [(35073, "Dynamixel 2.0"), (35074, "Dynamixel 2.0"), (35074, "Modbus-RTU")]
 ADDRESSES = {35073: (562, 596, 611), 35074: (512, 564, 580)}
 """Torque enable, goal position and present position in the e-Manual."""
 
@@ -58,10 +67,46 @@ def settle(gripper: driver.RHP12RN, angle: float, seconds: float = 6.0) -> list:
   return log
 
 
-@pytest.mark.parametrize(
-  ("number", "bus"),
-  [(35073, "Dynamixel 2.0"), (35074, "Dynamixel 2.0"), (35074, "Modbus-RTU")],
-)
+def registers(port: str, number: int, bus: str) -> bytes:
+  """Returns the control table, without the measured position."""
+  kind = buses.Modbus if bus == "Modbus-RTU" else buses.Dynamixel
+  line = kind(port, driver.BAUD, 1)
+  table = bytearray(b"".join(line.read(start, 200) for start in range(0, 1000, 200)))
+  line.close()
+  present = TABLES[number].present_position
+  table[present.address : present.address + present.size] = bytes(present.size)
+  return bytes(table)
+
+
+@pytest.mark.parametrize(("number", "bus"), BUSES)
+def test_only_commands_change_the_gripper(number, bus):
+  if modbus := bus == "Modbus-RTU":
+    pytest.importorskip("pymodbus", reason="needs pymodbus")
+  with bench(gripper=number, modbus=modbus) as (_, port):
+    before = registers(port, number, bus)
+    with held(port) as gripper:
+      gripper.get_observation()
+      time.sleep(0.2)
+    assert registers(port, number, bus) == before
+    torque = ADDRESSES[number][0]
+    assert before[torque] == 0
+    with held(port) as gripper:
+      gripper.send_action(False)
+      settle(gripper, 0.0)
+    after = registers(port, number, bus)
+  assert after[torque] == 1
+  table = TABLES[number]
+
+  def value(field: Field) -> int:
+    return int.from_bytes(after[field.address : field.address + field.size], "little")
+
+  share = value(table.goal_current) / table.largest_current
+  assert share == pytest.approx(driver.CURRENT_SHARE, abs=1e-3)
+  assert value(table.acceleration) == value(table.acceleration_limit) > 0
+  assert value(table.operating_mode) == 5 and value(table.goal_position) == OPEN
+
+
+@pytest.mark.parametrize(("number", "bus"), BUSES)
 def test_the_model_is_identified_and_opens_and_closes(number, bus):
   if modbus := bus == "Modbus-RTU":
     pytest.importorskip("pymodbus", reason="needs pymodbus")
@@ -155,9 +200,10 @@ def test_a_silent_gripper_is_one_line_in_time(modbus):
     begin = time.monotonic()
     with pytest.raises(DeviceError, match="does not answer: check its power") as error:
       while time.monotonic() < begin + 3:
-        gripper.get_observation()
+        last = gripper.get_observation().time
         time.sleep(0.01)
-    assert time.monotonic() < begin + 1.5
+    assert time.monotonic() < begin + 0.4  # 0.12 s on an idle machine.
+    assert last < begin + 0.1  # Until then, the old measurement keeps its time.
     assert "\n" not in str(error.value)
     with pytest.raises(DeviceError, match="does not answer"):
       gripper.send_action(True)
@@ -171,6 +217,8 @@ def test_a_hardware_error_is_one_line():
       while time.monotonic() < end:
         gripper.get_observation()
         time.sleep(0.01)
+    with pytest.raises(DeviceError, match="it is overloaded; turn it off and on"):
+      driver.connect(port)
 
 
 def test_another_dynamixel_is_one_line():

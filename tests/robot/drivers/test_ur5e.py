@@ -204,6 +204,14 @@ def test_a_controller_that_will_not_do_is_one_line(controller, text):
   assert "\n" not in str(error.value)
 
 
+def test_a_slowed_arm_does_not_start():
+  with (
+    doubles.start("push_plate", speed_slider=0.5) as devices,
+    pytest.raises(DeviceError, match="the speed slider is at 50%: set it to 100%"),
+  ):
+    devices.arm.start()
+
+
 def test_describe_names_device_and_versions(rig):
   about = rig.arm.describe()
   assert about["model"] == "UR5e" and about["serial_number"]

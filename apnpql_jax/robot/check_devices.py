@@ -1,0 +1,140 @@
+"""The rows of a check about devices, which are only read.
+
+Each function connects a device for as long as the stack is open, and returns what reads
+it, or a stand-in for one that does not work.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import contextlib
+import time
+from typing import Any
+
+import numpy as np
+
+from apnpql_jax.errors import DeviceError
+from apnpql_jax.robot import devices
+from apnpql_jax.robot.arm_model import ArmModel
+from apnpql_jax.robot.check_table import Table
+from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.limits import Limits, MotionLimiter
+from apnpql_jax.robot.protocols import ArmState, Frame
+from apnpql_jax.robot.supervisor import CAMERAS
+
+_WAIT_S = 5.0
+"""Time that a camera may take for its first frame."""
+
+_READINGS = 25
+"""Measurements of the joints, of whose ages the median counts."""
+
+Stack = contextlib.ExitStack
+
+
+def arm(
+  stack: Stack, table: Table, robot: Robot, neutral: np.ndarray
+) -> Callable[[], np.ndarray]:
+  """Adds the rows of the arm; returns what gives joint angles f64[6], rad."""
+  limits, model = robot.cell.limits(robot.contract), ArmModel()
+  with table.row("arm"):
+    device = devices.make_arm(robot, reads=True)
+    stack.enter_context(devices.connected(device))
+    state, age = _newest(robot, device)
+    table.rows["arm"] = f"{_text(device)}; measured {1e3 * age:.0f} ms ago"
+    for problem in _problems(device, state, age, limits):
+      table.fail("arm", problem)
+    force = ", ".join(f"{x:.1f}" for x in model.base_mat @ state.wrench[:3])
+    tool = ", ".join(f"{x:.3f}" for x in model.tool_position(state.position))
+    table.rows["force"] = f"({force}) N in the world, before it is zeroed"
+    table.rows["tool"] = f"at ({tool}) m, inside the workspace box"
+    if outside := MotionLimiter(limits, model.tool_position).start(state.position):
+      table.fail("tool", f"{outside}: move the arm by hand")
+    return lambda: device.get_observation().position
+  return lambda: neutral
+
+
+def gripper(stack: Stack, table: Table, robot: Robot) -> Callable[[], float]:
+  """Adds the row of the gripper; returns what gives the finger's angle, rad."""
+  with table.row("gripper"):
+    device = devices.make_gripper(robot)
+    stack.enter_context(devices.connected(device))
+    angle = device.get_observation().angle
+    table.rows["gripper"] = f"{_text(device)}; at {angle:.2f} rad"
+    return lambda: device.get_observation().angle
+  return lambda: 0.0
+
+
+def cameras(
+  stack: Stack, table: Table, robot: Robot
+) -> Callable[[], Sequence[Frame]] | None:
+  """Adds a row for each camera; returns what gives their frames, if all work."""
+  with table.row("cameras"):
+    opened = stack.enter_context(devices.open_cameras(robot))
+    for camera in opened:
+      _first_frame(camera)
+    for name, camera in zip(CAMERAS, opened, strict=True):
+      view, shape = robot.contract["cameras"][name], _first_frame(camera).image.shape
+      if shape != (view["height"], view["width"], 3):
+        raise DeviceError(
+          f"camera {name}: an image of {shape}, not {view['height']} x "
+          f"{view['width']} pixels"
+        )
+      table.rows[f"camera {name}"] = _text(camera)
+    return lambda: [camera.get_observation() for camera in opened]
+  return None
+
+
+def ages(table: Table, robot: Robot, found: np.ndarray) -> None:
+  """Adds the ages of the frames to their rows, f64[2], s."""
+  most = robot.cell.limits(robot.contract).frame_age
+  for name, age in zip(CAMERAS, found, strict=True):
+    row, text = f"camera {name}", f"frames of {1e3 * age:.0f} ms when it acts"
+    if age > most:
+      table.fail(row, f"{text}, the limit is {1e3 * most:.0f} ms")
+    else:
+      table.rows[row] += f"; {text}"
+
+
+def _newest(robot: Robot, device: Any) -> tuple[ArmState, float]:
+  """Returns a measurement of the arm, and the median age of some, s."""
+  found = []
+  for _ in range(_READINGS):
+    state = device.get_observation()
+    found.append(robot.clock.now() - state.time)
+    robot.clock.sleep(0.01)
+  return state, float(np.median(found))
+
+
+def _problems(device: Any, state: ArmState, age: float, limits: Limits) -> list[str]:
+  """Returns what keeps the arm from following."""
+  found = [state.fault] if state.fault else []
+  found += getattr(device, "problems", list)()  # Simulated arms have none.
+  if age > limits.joint_age:
+    found.append(
+      f"its joints were measured {1e3 * age:.0f} ms ago, the limit is "
+      f"{1e3 * limits.joint_age:.0f} ms: check the network"
+    )
+  return found
+
+
+def _first_frame(camera: Any) -> Frame:
+  """Returns a frame; cameras may need a while for the first one."""
+  until = time.monotonic() + _WAIT_S
+  while True:
+    try:
+      return camera.get_observation()
+    except DeviceError:
+      if time.monotonic() > until:
+        raise
+      time.sleep(0.1)
+
+
+def _text(device: Any) -> str:
+  """Returns model, serial number and versions in a line."""
+  about = device.describe()
+  shown = {key: x for key, x in about.items() if isinstance(x, str | int)}
+  plain = "model", "bus"
+  return ", ".join(
+    str(x) if key in plain else f"{key.replace('_', ' ')} {x}"
+    for key, x in shown.items()
+  )
