@@ -153,6 +153,10 @@ def joint_outside(bench: Bench) -> None:
   bench.arm.position = np.full(6, 6.28)
 
 
+def a_turn_away(bench: Bench) -> None:
+  bench.arm.position = bench.policy.neutral + 2 * np.pi * np.eye(6)[0]
+
+
 def stale_frames(bench: Bench) -> None:
   bench.cameras[1].age = 0.15
 
@@ -191,6 +195,7 @@ def broken(bench: Bench) -> None:
     (protective_stop, "arm", "FAILS: protective stop"),
     (tool_outside, "tool", "is outside the workspace box: move the arm by hand"),
     (joint_outside, "tool", "is outside its range"),
+    (a_turn_away, "tool", "is outside the workspace box: first move the arm by hand"),
     (stale_frames, "camera wrist", "when it acts, the limit is 100 ms"),
     (small_images, "cameras", "camera global: an image of (7, 9, 3), not 72 x 96"),
     (slow_program, "program", "per action, period 150 ms: use a faster machine"),
