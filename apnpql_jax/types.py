@@ -46,6 +46,9 @@ class Observation(struct.PyTreeNode):
   objects: Float[Array, "*b 3*k"] | None = None
   """The k points of ``Task.objects``, m; only with ``--obs state``."""
 
+  primitives: Float[Array, "*b 3 7"] | None = None
+  """The labels of ``TimeStep``; only with ``env.true_primitives``."""
+
 
 class TimeStep(struct.PyTreeNode):
   """One instant of one world. Terminal instants are kept; the next one is a reset."""

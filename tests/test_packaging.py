@@ -54,10 +54,10 @@ def python(site: Path, cwd: Path, *args: str) -> str:
   return done.stdout
 
 
-def locked(name: str) -> dict[str, str]:
-  """Returns normalized name -> version of a lock file."""
-  pairs = [line.split("==") for line in (ROOT / name).read_text().splitlines()]
-  return {canonicalize_name(package): version for package, version in pairs}
+def locked(name: str) -> dict[str, Requirement]:
+  """Returns normalized name -> requirement of a lock file."""
+  lines = (ROOT / name).read_text().splitlines()
+  return {canonicalize_name(x.name): x for x in map(Requirement, lines)}
 
 
 def test_wheel_holds_scenes_presets_and_the_whole_package(wheel):
@@ -106,7 +106,7 @@ def test_command_is_declared(installed):
 @pytest.mark.parametrize("name", sorted(p.name for p in ROOT.glob("*.lock")))
 def test_lock_is_plain_names_and_versions(name):
   for line in (ROOT / name).read_text().splitlines():
-    assert re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.]+", line), line
+    assert re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.]+(; python_version .+)?", line)
 
 
 @pytest.mark.parametrize(
@@ -119,8 +119,10 @@ def test_lock_is_plain_names_and_versions(name):
 def test_lock_satisfies_the_requirements_of_the_project(lock, wanted):
   versions = locked("requirements.lock") | locked(lock)
   for requirement in map(Requirement, wanted):
-    version = versions[canonicalize_name(requirement.name)]
+    found = versions[canonicalize_name(requirement.name)]
+    (version,) = (x.version for x in found.specifier)
     assert requirement.specifier.contains(version, prereleases=True), requirement
+    assert found.marker == requirement.marker
 
 
 def test_the_workflow_caches_what_the_tests_compile():
@@ -131,7 +133,7 @@ def test_the_workflow_caches_what_the_tests_compile():
 
 def test_mujoco_and_mjx_are_a_matched_pair():
   versions = locked("requirements.lock")
-  assert versions["mujoco"] == versions["mujoco-mjx"]
+  assert versions["mujoco"].specifier == versions["mujoco-mjx"].specifier
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ from apnpql_jax.types import ACTION_DIM, NUM_PRIMITIVES, Array, Observation
 
 Params = dict[str, Any]  # by group; groups that an algorithm lacks are absent
 GROUPS = ("encoder", "ap", "bp", "z", "alpha", "policy")
+_SURE = 10.0  # logit of a true gripper command
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +49,10 @@ class Networks:
 
   def at(self, params: Params, observation: Observation) -> Heads:
     """Returns the heads at a batch of states; only this method runs the encoder."""
-    return Heads(self, params, self.apply("encoder", params, observation))
+    given = observation.primitives
+    if given is not None and self.config.lstm_instants:
+      given = given[..., -1, :, :]
+    return Heads(self, params, self.apply("encoder", params, observation), given)
 
   def apply(self, group: str, params: Params, *inputs: Any, **options: Any) -> Any:
     """Applies the module of ``group`` to ``inputs``."""
@@ -88,6 +92,8 @@ class Heads:
   networks: Networks
   params: Params
   phi: Float[Array, "*b feature_dim"]
+  given: Float[Array, "*b 3 7"] | None
+  """True primitives that replace the predicted ones."""
 
   @property
   def config(self) -> AgentConfig:
@@ -105,8 +111,12 @@ class Heads:
     They are unbounded: labels often lie at the bounds of [-1, 1], where a squashed
     output would lose its gradient.
     """
-    flat = self._apply("ap", self.phi)
-    return flat.reshape(*self.phi.shape[:-1], NUM_PRIMITIVES, ACTION_DIM)
+    if self.given is None:
+      flat = self._apply("ap", self.phi)
+      found = flat.reshape(*self.phi.shape[:-1], NUM_PRIMITIVES, ACTION_DIM)
+    else:
+      found = self.given.at[..., -1].set(_SURE * (2.0 * self.given[..., -1] - 1.0))
+    return found if self.config.primitive_gripper else found.at[..., -1].set(0.0)
 
   def prior(self) -> GripperGMM:
     """Returns the behavior prior b_theta; trains only the bp group.

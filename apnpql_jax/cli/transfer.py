@@ -14,7 +14,7 @@ from apnpql_jax.cli.commands import (
   existing_run,
   task_env,
 )
-from apnpql_jax.cli.options import File, Flag, OfRun, default_hint
+from apnpql_jax.cli.options import AsTrained, File, Flag, OfRun, default_hint
 from apnpql_jax.errors import ConfigError
 
 EXPERT = "expert"
@@ -24,8 +24,8 @@ EXPERT = "expert"
 class Transfer(OfRun):
   """Plays a policy in another simulator: apnpql transfer RUN [options].
 
-  The scripted expert sees no images. Where it solves less than 95 %, a cell says
-  nothing about a policy.
+  The scripted expert sees no images. Where it solves less than 95 %, a cell is no
+  evidence about a policy.
 
   apnpql transfer runs/mine --renderer opengl --looks unseen
 
@@ -52,13 +52,13 @@ class Transfer(OfRun):
   latency_ms: Annotated[int | None, default_hint("(default: 30)")] = None
   """With bullet: time from the virtual arm to the servos: 0, 30 or 60 ms."""
 
-  admittance: bool = False
+  admittance: Flag = False
   """With bullet: whether the virtual arm yields to the wrench at the tool."""
 
   checkpoint: str = "newest"
   """Checkpoint: newest, best (highest success rate in training) or its step."""
 
-  acting: Annotated[str | None, default_hint("(default: as in training)")] = None
+  acting: AsTrained = None
   """How to choose an action, see `apnpql evaluate --help`."""
 
   episodes: int = 200
@@ -85,35 +85,21 @@ def transfer(args: Transfer) -> dict[str, Any]:
   expert = args.run == EXPERT and not Path(EXPERT, "config.json").exists()
   if expert != bool(args.task):
     raise ConfigError("--task names the task of the expert; runs have their own")
-  chosen = (
-    args.physics,
-    args.renderer,
-    args.looks,
-    args.latency_ms,
-    args.admittance,
-  )
   check_free(args.video, overwrite=args.overwrite)
-  common: dict[str, Any] = {
+  env_config = task_env(args.task) if expert else None
+  if env_config is None:
+    existing_run(args.run, "transfer", args.task_file)
+
+  from apnpql_jax.transfer import transfer as playing  # Imports JAX.
+  from apnpql_jax.transfer.cell import Cell
+
+  cell = Cell(args.physics, args.renderer, args.looks, args.latency_ms, args.admittance)
+  options: dict[str, Any] = {
     "episodes": args.episodes,
     "seed": args.seed,
     "video": args.video,
   }
-  if expert:
-    env = task_env(args.task)
-
-    from apnpql_jax.transfer.cell import Cell
-    from apnpql_jax.transfer.transfer import transfer_expert
-
-    return transfer_expert(env, Cell(*chosen), **common)
-  run_dir = existing_run(args.run, "transfer", args.task_file)
-
-  from apnpql_jax.transfer.cell import Cell
-  from apnpql_jax.transfer.transfer import transfer as transfer_run
-
-  return transfer_run(
-    run_dir,
-    Cell(*chosen),
-    step=checkpoint_step(args.run, args.checkpoint),
-    acting=args.acting,
-    **common,
-  )
+  if env_config is not None:
+    return playing.transfer_expert(env_config, cell, **options)
+  step = checkpoint_step(args.run, args.checkpoint)
+  return playing.transfer(args.run, cell, step=step, acting=args.acting, **options)

@@ -71,7 +71,8 @@ PROCESS_BYTES = 9 << 28
 2 GiB for the libraries and for a first compilation, which frees 1.3 of them, and 256
 MiB for a checkpoint. `benchmarks.reliability.memory` measures it."""
 
-_OTHER_BYTES = 4 * (21 + 3 + 7 + 21 + 2) + 2
+_PRIMITIVE_BYTES = 4 * 3 * 7
+_OTHER_BYTES = 4 * (21 + 3 + 7 + 2) + _PRIMITIVE_BYTES + 2
 """Bytes of a slot without images: robot state, tool, action, primitive labels, reward
 and log density of the action (f32), and the two end flags."""
 
@@ -148,6 +149,12 @@ def check_agent(
       raise ConfigError(f"agent.{name}={getattr(agent, name)} must be within (0, 1]")
   if not agent.hidden or min(agent.hidden) < 1 or max(agent.hidden) >= 2**31:
     raise ConfigError(f"agent.hidden={agent.hidden} must be positive layer widths")
+  learns = agent.gripper_offset or agent.prior_mean == "learned"
+  if not agent.primitive_gripper and not learns:
+    raise ConfigError(
+      "without agent.primitive_gripper, only the M-step can learn when to close; set "
+      "agent.gripper_offset"
+    )
   for name, components in (("min_prob", 3), ("policy_min_prob", 2)):
     if not 0.0 < (prob := getattr(agent, name)) < 1.0 / components:
       raise ConfigError(f"agent.{name}={prob} must be within (0, 1/{components})")
@@ -173,6 +180,7 @@ def replay_bytes(config: TrainConfig) -> int:
   """Returns an upper bound on the bytes of both replays, without object points."""
   images = math.prod(config.env.global_size) + math.prod(config.env.wrist_size)
   slot = _OTHER_BYTES + (3 * images if config.env.obs == "pixels" else 0)
+  slot += _PRIMITIVE_BYTES * config.env.true_primitives
   return slot * (config.replay.capacity + config.replay.expert_steps)
 
 

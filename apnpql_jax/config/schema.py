@@ -52,6 +52,14 @@ class EnvConfig:
   shadows: bool = codec.added(False)
   """Draw the shadow of the hand on the table, a cue to the height of the hand."""
 
+  static_targets: bool = codec.added(False)
+  """Primitives lead to the joint targets of the reset state, also after objects have
+  moved."""
+
+  true_primitives: bool = codec.added(False)
+  """Observations include the true primitives, and the agent takes them in place of its
+  predictions: an oracle, for ablations."""
+
   randomize: bool = codec.added(False)
   """Randomize the world of every episode, within the ranges of `randomization`."""
 
@@ -135,6 +143,10 @@ class AgentConfig:
 
   prior_mean: str = "primitives"
   """Means of the prior: primitives (predicted) or learned (by the M-step)."""
+
+  primitive_gripper: bool = codec.added(True)
+  """Whether a primitive has a gripper command; otherwise only the M-step learns when to
+  close, which needs `gripper_offset`."""
 
   gripper_offset: bool = codec.added(False, before=True)
   """Whether the M-step adds to the logits of closing the gripper that the primitives

@@ -34,6 +34,7 @@ MEANINGS = {
   "global_image": "RGB, rows from the top; see cameras.global",
   "wrist_image": "RGB, rows from the top; see cameras.wrist",
   "objects": "points on the objects in the world, m; no sensor gives them",
+  "primitives": "the true primitives, as actions; no sensor gives them",
 }
 
 

@@ -30,7 +30,14 @@ from apnpql_jax.sim.kinematics import Kinematics, make_kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.tasks import Task, make_task, task_names
-from apnpql_jax.types import Array, Observation, TimeStep
+from apnpql_jax.types import (
+  ACTION_DIM,
+  ARM_DOF,
+  NUM_PRIMITIVES,
+  Array,
+  Observation,
+  TimeStep,
+)
 
 HISTORY = 3  # robot states stacked in an observation (paper Sec. V-A)
 HELD_OUT_SHARE = 0.25  # share of the bank's rows that is reserved for evaluation
@@ -171,8 +178,10 @@ class Env:
 
   def expert_action(self, state: EnvState) -> Float[Array, "worlds 7"]:
     """Returns the actions of the task's scripted expert."""
-    kinematics = self._kinematics(state.physics)
-    return self.task.expert(state.physics, kinematics, state.timestep.primitives)
+    kinematics, primitives = self._kinematics(state.physics), state.timestep.primitives
+    if self.config.static_targets:  # They do not lead to objects that have moved.
+      _, primitives = self._tracked(state.physics, kinematics, state.targets)
+    return self.task.expert(state.physics, kinematics, primitives)
 
   def view(
     self, renderer: Renderer, state: PhysicsState
@@ -208,29 +217,39 @@ class Env:
     """Computes all of ``observe`` except the last L observations."""
     state, fresh = arrival.physics, arrival.fresh
     kinematics = self._kinematics(state)
-    # Move the joint targets of the primitives to where the tool should be now.
-    *pose, close = self.task.tool_targets(state, kinematics)
-    q = state.qpos[:, self.task.scene.arm_qpos]
-    present = jnp.broadcast_to(q[:, None], arrival.targets.shape)
-    chain = arm.with_base(self._chain, self.task.scene, state.fields)
-    targets = tracking.refine(chain, arrival.targets, present, *pose)
+    targets, tracked = self._tracked(state, kinematics, arrival.targets)
+    primitives = tracked
+    if self.config.static_targets:
+      targets, q = arrival.targets, state.qpos[:, None, self.task.scene.arm_qpos]
+      velocity = tracking.follow(targets, q)
+      primitives = jnp.concatenate([velocity, tracked[..., ARM_DOF:]], axis=-1)
     # An episode cannot end at its first instant.
     solved = self.task.success(state, kinematics) & ~fresh
     late = (arrival.elapsed >= self.config.episode_steps) & ~fresh
-    primitives = jnp.concatenate(
-      [tracking.follow(targets, q[:, None]), close[..., None]], axis=-1
-    )
+    observation = self._observation(state, kinematics, fresh, arrival.history)
+    if self.config.true_primitives:
+      observation = observation.replace(primitives=primitives)
     timestep = TimeStep(
-      observation=self._observation(state, kinematics, fresh, arrival.history),
+      observation=observation,
       reward=solved.astype(jnp.float32),
       terminated=solved,
       truncated=late & ~solved,
       primitives=primitives,
-      expert=self.task.expert(state, kinematics, primitives)
-      if self._imitated
-      else None,
+      expert=self.task.expert(state, kinematics, tracked) if self._imitated else None,
     )
     return EnvState(state, targets, arrival.elapsed, timestep, arrival.faults)
+
+  def _tracked(
+    self, state: PhysicsState, kinematics: Kinematics, targets: Array
+  ) -> tuple[Array, Array]:
+    """Returns joint targets moved to where the tool should be now, and primitives."""
+    *pose, close = self.task.tool_targets(state, kinematics)
+    q = state.qpos[:, self.task.scene.arm_qpos]
+    present = jnp.broadcast_to(q[:, None], targets.shape)
+    chain = arm.with_base(self._chain, self.task.scene, state.fields)
+    targets = tracking.refine(chain, targets, present, *pose)
+    velocity = tracking.follow(targets, q[:, None])
+    return targets, jnp.concatenate([velocity, close[..., None]], axis=-1)
 
   def _observation(
     self, state: PhysicsState, kinematics: Kinematics, fresh: Array, history: Array
@@ -293,6 +312,9 @@ def observation_shapes(config: EnvConfig, task: Task, *, instants: int) -> Obser
     return jax.ShapeDtypeStruct((1, *((instants,) if instants else ()), *shape), dtype)
 
   observation = Observation(robot=shapes(HISTORY * 7), tool=shapes(3))
+  if config.true_primitives:
+    primitives = shapes(NUM_PRIMITIVES, ACTION_DIM)
+    observation = observation.replace(primitives=primitives)
   if config.obs == "state":
     model = task.scene.model
     start = functools.partial(physics.initial_state, task.scene)

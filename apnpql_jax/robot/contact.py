@@ -4,9 +4,11 @@ The loop: the virtual tool moves, after ``lag`` the real one, which the contact 
 back with k times its way; the filtered force acts on the virtual arm. With one force
 along a direction n this is a loop of one signal, with the transfer function
 
-  k e^(-s lag) / (1 + s T) n^T J (M s^2 + (25 M + J^T D_c J) s)^-1 J^T n
+  a k e^(-s lag) / (1 + s T) n^T J (M s^2 + (25 M + a J^T D_c J) s)^-1 J^T n
 
-It is stable while its value is above -1 where its phase is -180 degrees (Nyquist).
+It is stable while its value is above -1 where its phase is -180 degrees (Nyquist). The
+share a (``virtual_arm.ramp``) is that of the wrench at which the arm rests, because it
+is the slope of the felt force as well as the share of the damping.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ def stiffness_limit(
   admittance: Admittance,
   lag: float,
   *,
+  share: float = 1.0,
   saturated: bool = False,
 ) -> float:
   """Returns the largest stable stiffness of a contact at the tool, N/m.
@@ -40,9 +43,10 @@ def stiffness_limit(
     admittance: Gives D_c.
     lag: Delay between the virtual position and the measured force, without that of the
       filter, s.
+    share: The share a.
     saturated: The motors are at their limit of acceleration, and do not damp.
   """
-  rows = admittance.damping * np.repeat([1.0, DAMPED_RADIUS**2], 3)
+  rows = share * admittance.damping * np.repeat([1.0, DAMPED_RADIUS**2], 3)
   damping = dynamics.tool.T @ (rows[:, None] * dynamics.tool)
   if not saturated:
     damping = damping + VELOCITY_GAIN * dynamics.mass
@@ -50,7 +54,7 @@ def stiffness_limit(
   s = 1j * _FREQUENCIES[:, None, None]
   moved = np.linalg.solve(dynamics.mass * s**2 + damping * s, way[:, None])
   s = s[:, 0, 0]
-  loop = np.exp(-s * lag) / (1 + s * FILTER_S) * (moved[..., 0] @ way)
+  loop = np.exp(-s * lag) / (1 + s * FILTER_S) * share * (moved[..., 0] @ way)
   # The phase begins at -90 degrees and falls; each crossing of -180 limits the gain.
   turns = np.flatnonzero((loop.imag[:-1] < 0) & (loop.imag[1:] >= 0))
   crossing = [-loop.real[i] for i in turns if loop.real[i] < 0]

@@ -24,6 +24,7 @@ from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.protocols import Arm, ArmState, Gripper
 from apnpql_jax.robot.supervisor import Action, Mode
+from apnpql_jax.robot.zero import Zero
 
 GRIPPER_CYCLE_S = 0.03
 """Time between messages to the gripper, whose line is slow."""
@@ -84,6 +85,7 @@ class Controller:
     self._target, self._told = np.zeros(6), (Mode.FOLLOW, "")
     self._ending, self._last = "", 0.0
     self._periods = np.zeros(PERIOD_BINS, int)
+    self._zero = Zero()
 
   @property
   def phase(self) -> Phase:
@@ -98,6 +100,7 @@ class Controller:
     """Reads the devices and the board, commands the arm, and publishes the state."""
     self._obey()
     state, now = self._arm.get_observation(), self._clock.now()
+    self._zero.note(state.wrench)
     step = (now - self._last) / PERIOD_BIN_S
     self._periods[int(min(step, PERIOD_BINS - 1))] += 1
     self._last = now
@@ -173,8 +176,10 @@ class Controller:
       self._target = order["target"].copy()
       if self._phase is Phase.HOME:
         self._gripper.close = bool(order["close"])
-      self._arm.start()
-      self._core.start(self._clock.now(), self._arm.get_observation())
+      refusal = self._zero.start(self._arm, again=self._phase is Phase.PLAY)
+      goal = self._target if self._phase is Phase.HOME else None
+      self._core.start(self._clock.now(), self._arm.get_observation(), goal)
+      self._core.supervisor.stop(refusal)
 
   def _rest(self) -> None:
     """Ends the motion of a command that is at rest."""

@@ -58,38 +58,58 @@ class Core:
     self.limiter = MotionLimiter(limits, model.tool_position)
     self.supervisor = Supervisor(limits, 0.0)
 
-  def start(self, now: float, state: ArmState) -> None:
-    """Starts or resumes an episode from the measured joint angles."""
+  def start(
+    self, now: float, state: ArmState, target: np.ndarray | None = None
+  ) -> None:
+    """Begins at the measured joint angles: an episode, or the way to a ``target``.
+
+    The first cycle stops if the arm is outside of its limits, or the way leads out.
+    """
     self.supervisor = Supervisor(self.limits, now)
     self.virtual.reset(state.position)
     self.supervisor.stop(self.limiter.start(state.position))
+    if target is not None:
+      self.supervisor.stop(self.limiter.obstruction(target))
 
   def step(self, now: float, state: ArmState, action: Action | None) -> Command:
     """Returns the command for the next 2 ms."""
-    limiter, virtual = self.limiter, self.virtual
-    measured = self._measured(now, state)
+    limiter, measured = self.limiter, self._measured(now, state)
     mode, reason = self.supervisor.judge(now, state, action, limiter.position)
     if mode is Mode.FOLLOW and action is not None:
-      virtual.step(action.values[:6], measured, state.wrench)
-      # Not the position, whose lead exceeds the limit of acceleration: 1.6 ms later.
-      proposed = virtual.velocity
-      limiter.step(proposed, measured, yielding=virtual.contact)
-      limited = np.abs(limiter.velocity - proposed).max() > _LIMITED
-      kept = limiter.velocity if limited else proposed
-      virtual.synchronize(limiter.position, kept)
+      self._simulate(action.values[:6], measured, state.wrench)
+    elif mode is Mode.HOLD and self.supervisor.pressed and self.virtual.admittance:
+      self._simulate(np.zeros(6), measured, state.wrench)  # The arm gives way.
     else:
       limiter.brake(measured)
-      virtual.synchronize(limiter.position, limiter.velocity)
+      self.virtual.synchronize(limiter.position, limiter.velocity)
     return Command(limiter.position.copy(), mode, reason, limiter.at_rest)
 
+  def _simulate(
+    self, desired: np.ndarray, measured: np.ndarray, wrench: np.ndarray
+  ) -> None:
+    """Moves as the virtual arm does with desired velocities f64[6], if allowed."""
+    limiter, virtual = self.limiter, self.virtual
+    virtual.step(desired, measured, wrench)
+    # Not the position, whose lead exceeds the limit of acceleration: 1.6 ms later.
+    proposed = virtual.velocity
+    limiter.step(proposed, measured, yielding=virtual.share > 0)
+    limited = np.abs(limiter.velocity - proposed).max() > _LIMITED
+    virtual.synchronize(limiter.position, limiter.velocity if limited else proposed)
+
   def move(self, now: float, state: ArmState, target: np.ndarray) -> Command:
-    """Returns the command for the next 2 ms on a straight line of joints to a pose."""
+    """Returns the command for the next 2 ms on a straight line of joints to a pose.
+
+    All joints start and slow down together, so neither the acceleration nor the ranges
+    of single joints bend the line, and a hold does not either. Only an arm that lags by
+    more than ``Limits.deviation`` does; from there, another line leads to the pose.
+    """
     limiter, gap = self.limiter, target - self.limiter.position
     mode, reason = self.supervisor.judge_arm(now, state, limiter.position)
     far = np.abs(gap).max()
     if mode is Mode.FOLLOW and far > _ARRIVED:
       slowing = 0.5 * self.limits.acceleration
-      speed = min(HOME_SPEED, np.sqrt(2 * slowing * far), far / TIMESTEP)
+      speed = np.abs(limiter.velocity).max() + slowing * TIMESTEP
+      speed = min(speed, HOME_SPEED, np.sqrt(2 * slowing * far), far / TIMESTEP)
       limiter.step(gap / far * speed, state.position)
     else:
       limiter.brake(self._measured(now, state))

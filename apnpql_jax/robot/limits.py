@@ -3,6 +3,9 @@
 Every 2 ms a ``MotionLimiter`` turns a proposed joint velocity into the position that
 the arm is to have next. Its state always leaves a way to stop inside of the boxes: the
 next velocity is accepted only if braking from it ends inside.
+
+An arm may begin on the border, where it may have come to rest, or beyond it by its own
+error. From there it may only move inwards, as also when something has pushed it there.
 """
 
 from __future__ import annotations
@@ -30,8 +33,30 @@ DEVIATION = 0.05
 MARGIN = 0.002
 """Distance from the workspace box that is kept, m; above the error of its samples."""
 
+SLACK = 0.002
+"""How far the tool may begin outside of the workspace box, m.
+
+The error of a measured arm at rest against its command; 2 mm at 0.8 m are 2.5 mrad.
+"""
+
+JOINT_SLACK = 0.0025
+"""How far a joint may begin outside of its range, rad; see ``SLACK``."""
+
 _STILL = 1e-6
 """Joint velocity below which a command stands still, rad/s."""
+
+_WAY_STEP = 0.004
+"""Distance of the poses at which a way is looked at before it begins, rad.
+
+If all joints turn so much, the tool is within 0.1 mm of the chord.
+"""
+
+_GRACE = 1e-4
+"""By how much a tool that has begun outside may move out, m, as a way may be curved."""
+
+_EVERYWHERE = np.array([[-np.inf, np.inf]] * 3)
+
+_OUT = "outside the workspace box"
 
 _WAY = (0.0, 0.25, 0.5, 0.75, 1.0)
 """Parts of a braking distance at which the tool must be inside the workspace box."""
@@ -84,19 +109,48 @@ class MotionLimiter:
     """Keeps the limits; ``tool_position`` maps joint angles to m in the world."""
     self.limits, self._tool = limits, tool_position
     self.position, self.velocity = np.zeros(6), np.zeros(6)
-    self._low, self._high = limits.box.T + np.array([[MARGIN], [-MARGIN]])
+    self._inside = limits.box + np.array([MARGIN, -MARGIN])
+    self._box = self._inside
+    """Where the tool may be: inside, or no further out than it has begun, f64[3, 2]."""
 
   def start(self, position: np.ndarray) -> str:
     """Begins at rest; returns why the arm must not move there, or an empty string."""
     self.position, self.velocity = np.array(position, float), np.zeros(6)
-    low, high = self.limits.joints.T
-    outside = np.flatnonzero((self.position < low) | (self.position > high))
-    if not np.isfinite(self.position).all() or len(outside):
-      return f"joint {', '.join(map(str, outside + 1))} is outside its range"
-    tool = self._tool(self.position)
-    if (tool < self._low).any() or (tool > self._high).any():
-      place = ", ".join(f"{x:.3f}" for x in tool)
-      return f"the tool at ({place}) m is outside the workspace box"
+    if reason := self.outside(self.position, is_there=True):
+      return reason
+    self._box = self._tightened(_EVERYWHERE, self._tool(self.position))
+    return ""
+
+  def outside(self, position: np.ndarray, *, is_there: bool = False) -> str:
+    """Returns why a pose is outside of the limits, or an empty string.
+
+    Args:
+      position: Joint angles f64[6].
+      is_there: The arm is at the pose, so its own error is allowed.
+    """
+    slack = np.array([-1.0, 1.0]) * is_there
+    low, high = (self.limits.joints + JOINT_SLACK * slack).T
+    joints = np.flatnonzero(~((low <= position) & (position <= high)))
+    if len(joints):
+      return f"joint {', '.join(map(str, joints + 1))} is outside its range"
+    tool = self._tool(position)
+    box = self.limits.box + SLACK * slack if is_there else self._inside
+    return "" if _holds(box, tool) else f"the tool at {_text(tool)} is {_OUT}"
+
+  def obstruction(self, target: np.ndarray) -> str:
+    """Returns why the straight way of joints to a pose f64[6] is not free."""
+    if reason := self.outside(target):
+      return f"at the end of the way {reason}"
+    way, box = target - self.position, self._box
+    count = 2 + int(np.abs(way).max() / _WAY_STEP)
+    for part in np.linspace(0.0, 1.0, count):
+      tool = self._tool(self.position + part * way)
+      if not _holds(box, tool):
+        return (
+          f"on the straight way the tool at {_text(tool)} is {_OUT}: first move the "
+          "arm by hand to where its way is free"
+        )
+      box = self._tightened(box, tool)
     return ""
 
   def step(
@@ -158,8 +212,7 @@ class MotionLimiter:
     after = self.position + TIMESTEP * velocity
     way = velocity * np.abs(velocity).max() / (2 * self.limits.acceleration)
     for part in _WAY:
-      tool = self._tool(after + part * way)
-      if (tool < self._low).any() or (tool > self._high).any():
+      if not _holds(self._box, self._tool(after + part * way)):
         return False
     return True
 
@@ -174,4 +227,25 @@ class MotionLimiter:
   def _advance(self, velocity: np.ndarray) -> np.ndarray:
     self.position = self.position + TIMESTEP * velocity
     self.velocity = velocity
+    tool = self._tool(self.position)
+    # Out of the box, the arm itself has taken the command along.
+    box = self._box if _holds(self._box, tool) else _EVERYWHERE
+    self._box = self._tightened(box, tool)
     return self.position.copy()
+
+  def _tightened(self, box: np.ndarray, tool: np.ndarray) -> np.ndarray:
+    """Returns a box f64[3, 2] that a tool outside may not leave further outwards."""
+    if _holds(self._inside, tool):
+      return self._inside
+    low = np.minimum(self._inside[:, 0], tool - _GRACE)
+    high = np.maximum(self._inside[:, 1], tool + _GRACE)
+    return np.stack([np.maximum(box[:, 0], low), np.minimum(box[:, 1], high)], axis=1)
+
+
+def _holds(box: np.ndarray, tool: np.ndarray) -> bool:
+  """Returns whether a point f64[3] is in a box f64[3, 2]."""
+  return bool(((box[:, 0] <= tool) & (tool <= box[:, 1])).all())
+
+
+def _text(tool: np.ndarray) -> str:
+  return f"({', '.join(f'{x:.3f}' for x in tool)}) m"

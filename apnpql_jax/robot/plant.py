@@ -2,7 +2,7 @@
 
 The arm is position-controlled as with the controller's ``servoJ``: it follows a target
 with a lag, by stiff feedback with gravity compensation, against the friction of its
-joints. The wrist sensor reports the contacts of hand and fingers, with noise and bias.
+joints. The wrist sensor reports the contacts of hand and fingers, see ``sensor``.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from apnpql_jax.robot.arm_model import BASE, FLANGE, JOINTS
 from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.protocols import ArmState
+from apnpql_jax.robot.sensor import Sensor
 from apnpql_jax.sim import motors
 
 
@@ -34,12 +35,6 @@ class Servo:
 
   latency_s: float = 0.0
   """Time until a command arrives, s."""
-
-  force_noise_n: float = 0.5
-  """Standard deviation of the force, N; a tenth of it in N m for the torque."""
-
-  force_bias_n: float = 1.5
-  """Standard deviation of the bias that remains after zeroing, N."""
 
 
 class Plant:
@@ -60,15 +55,13 @@ class Plant:
     self._finger, self._finger_dof = int(finger.qposadr[0]), int(finger.dofadr[0])
     self._limit = model.actuator_ctrlrange[: len(JOINTS), 1].copy()
     self._hand = _subtree(model, model.body("gripper").id)
-    self._rng = np.random.default_rng(seed)
-    self._bias = np.zeros(6)
+    self._sensor = Sensor(np.random.default_rng(seed))
     self.data.qpos[:] = model.keyframe("neutral").qpos
     self._settle()
 
   def zero_force(self) -> None:
-    """Draws the bias that the sensor keeps after it has been zeroed."""
-    scale = self.servo.force_bias_n * np.repeat([1.0, 0.1], 3)
-    self._bias = scale * self._rng.normal(size=6)
+    """Zeroes the sensor: what it feels now, it takes for nothing."""
+    self._sensor.zero(self.wrench())
 
   def place(
     self, qpos: np.ndarray, mocap_pos: np.ndarray, mocap_quat: np.ndarray
@@ -111,14 +104,8 @@ class Plant:
   def arm_state(self, now: float) -> ArmState:
     """Returns what the arm measures."""
     data = self.data
-    scale = self.servo.force_noise_n * np.repeat([1.0, 0.1], 3)
-    noise = scale * self._rng.normal(size=6)
-    return ArmState(
-      now,
-      data.qpos[self._qpos].copy(),
-      data.qvel[self._dof].copy(),
-      self.wrench() + self._bias + noise,
-    )
+    position, velocity = data.qpos[self._qpos].copy(), data.qvel[self._dof].copy()
+    return ArmState(now, position, velocity, self._sensor.read(self.wrench()))
 
   def wrench(self) -> np.ndarray:
     """Returns force and torque of the contacts on the hand, see ``ArmState.wrench``."""

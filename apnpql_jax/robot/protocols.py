@@ -90,8 +90,8 @@ class Arm(Device, Protocol):
     """Brakes to rest; the arm follows commands again after ``start``."""
     ...
 
-  def start(self) -> None:
-    """Zeroes the wrench at rest and makes the arm follow commands."""
+  def start(self, *, zero: bool = True) -> None:
+    """Makes the arm follow commands; ``zero``: zeroes the wrench first, at rest."""
     ...
 
 

@@ -10,10 +10,13 @@ import signal
 import time
 from typing import Any
 
+import numpy as np
+
 from apnpql_jax.errors import INTERRUPTED, DeviceError, RunStopped
 from apnpql_jax.robot import control_process, policy_process, simulated
 from apnpql_jax.robot.board import Board, Phase
 from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.limits import Limits
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.supervisor import Mode
 
@@ -126,10 +129,15 @@ class Session(contextlib.AbstractContextManager):
   def go_home(self) -> None:
     """Moves the arm to the neutral pose of the policy.
 
+    A simulated arm that presses on something is freed first, as a person would do.
+
     Raises:
       DeviceError: It cannot get there, or a process has ended.
     """
     policy = self._policy
+    force = np.linalg.norm(self.board["state"].read()["wrench"][:3])
+    if self._plant is not None and force > Limits.hold_force:
+      self._park(self._plant)
     self._order(Phase.HOME, target=policy.neutral, close=int(policy.begins_closed))
     self._wait(self._is_done, HOME_S * self._clock.slowdown, "the arm to go home")
     state = self.board["state"].read()
@@ -232,6 +240,15 @@ class Session(contextlib.AbstractContextManager):
     wait = 30.0 * self._clock.slowdown
     self._wait(
       lambda: plant["plant"].read()["scene"] == self._scene, wait, "the objects to rest"
+    )
+
+  def _park(self, plant: Board) -> None:
+    """Puts a simulated arm back where it began."""
+    number = plant["plant"].read()["parked"] + 1
+    plant["scene"].write({"parked": number})
+    wait = 30.0 * self._clock.slowdown
+    self._wait(
+      lambda: plant["plant"].read()["parked"] == number, wait, "the arm to be free"
     )
 
   def _is_ready(self) -> bool:

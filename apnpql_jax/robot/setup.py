@@ -48,7 +48,7 @@ def describe(
   cell = cells.load(path) if kind == "ur5e" else cells.Cell()
   robot = Robot(kind, policy.contract, cell, Clock(slowdown))
   limits, model = cell.limits(policy.contract), ArmModel()
-  outside = MotionLimiter(limits, model.tool_position).start(policy.neutral)
+  outside = MotionLimiter(limits, model.tool_position).outside(policy.neutral)
   if outside:
     raise ConfigError(f"{path}: in the neutral pose of the policy {outside}")
   _check_scene(policy)

@@ -33,6 +33,7 @@ RECORDS = {
   "plant": [
     ("ready", "i8"),
     ("scene", "i8"),
+    ("parked", "i8"),
     ("time", "f8"),
     ("position", "f8", 6),
     ("velocity", "f8", 6),
@@ -45,8 +46,9 @@ RECORDS = {
   ],
   "servo": [("follow", "i8"), ("target", "f8", 6), ("zero", "i8")],
   "grip": [("close", "i8")],
-  # From the main process: the number of the reset state to show.
-  "scene": [("number", "i8"), ("quit", "i8")],
+  # From the main process: the number of the reset state to show, and how often the arm
+  # was to be put back where it began.
+  "scene": [("number", "i8"), ("parked", "i8"), ("quit", "i8")],
 }
 
 _CATCH_UP_S = 0.02
@@ -105,10 +107,10 @@ class SimulatedArm(_OnBoard):
     """See ``Arm.stop``."""
     _opened(self._board)["servo"].write({"follow": 0})
 
-  def start(self) -> None:
+  def start(self, *, zero: bool = True) -> None:
     """See ``Arm.start``."""
     position = self.get_observation().position
-    self._zeroed += 1
+    self._zeroed += zero
     _opened(self._board)["servo"].write(
       {"follow": 1, "target": position, "zero": self._zeroed}
     )
@@ -194,6 +196,11 @@ class Scene:
     plant.place(draw.qpos[0], draw.mocap_pos[0], draw.mocap_quat[0])
     return variant
 
+  def park(self, plant: Plant) -> None:
+    """Puts the arm near the neutral pose, as a person would free it."""
+    scene = self._task.scene
+    plant.put_arm(scene.keyframe("neutral")[scene.arm_qpos] + PARKED)
+
   @staticmethod
   def state_of(plant: Plant) -> dict[str, np.ndarray]:
     """Returns the arrays of ``_MOST``, padded."""
@@ -219,7 +226,6 @@ def main(name: str, task_name: str, options: dict[str, Any]) -> None:
     task = tasks.make_task(task_name)
     servo = Servo(latency_s=options["latency_s"])
     plant = Plant(task.scene.model, servo, seed=options["seed"])
-    plant.put_arm(task.scene.keyframe("neutral")[task.scene.arm_qpos] + PARKED)
     _run(board, plant, Scene(task, seed=options["seed"]), options["clock"])
   except Exception as error:  # Shown by the main process, which ends the session.
     with contextlib.suppress(Exception):
@@ -230,6 +236,8 @@ def main(name: str, task_name: str, options: dict[str, Any]) -> None:
 
 def _run(board: Board, plant: Plant, scene: Scene, clock: Clock) -> None:
   parent, shown, zeroed, variant, since = parent_process(), 0, 0, 0, 0.0
+  parked = 0
+  scene.park(plant)
   due = clock.now()
   while parent is None or parent.is_alive():
     servo, grip, order = (board[x].read() for x in ("servo", "grip", "scene"))
@@ -237,6 +245,9 @@ def _run(board: Board, plant: Plant, scene: Scene, clock: Clock) -> None:
       return
     if order["number"] != shown:
       variant, shown, since = scene.place(plant), int(order["number"]), clock.now()
+    if order["parked"] != parked:
+      parked = int(order["parked"])
+      scene.park(plant)
     if servo["zero"] != zeroed:
       zeroed = int(servo["zero"])
       plant.zero_force()
@@ -249,6 +260,7 @@ def _run(board: Board, plant: Plant, scene: Scene, clock: Clock) -> None:
       {
         "ready": 1,
         "scene": shown if settled else 0,
+        "parked": parked,
         "time": state.time,
         "position": state.position,
         "velocity": state.velocity,

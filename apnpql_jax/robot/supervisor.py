@@ -1,6 +1,7 @@
 """The judge of each control cycle: follow the policy, hold, or stop, and why.
 
-Both a hold and a stop brake to rest. A hold ends with its cause; a stop ends the
+Both a hold and a stop brake to rest, but in a hold because of the force on the tool, an
+arm with admittance gives way to it. A hold ends with its cause; a stop ends the
 episode.
 """
 
@@ -66,6 +67,11 @@ class Supervisor:
     self._number, self._valid, self._refusal = 0, None, ""
     self._forced, self._strong = None, -np.inf
     self._stop = ""
+
+  @property
+  def pressed(self) -> bool:
+    """Whether the force on the tool is, or just was, so large that the arm holds."""
+    return self._forced is not None
 
   def stop(self, reason: str) -> None:
     """Ends the motion; the first reason stays."""

@@ -5,23 +5,32 @@ torques. So the arm is simulated in step with the real one, and the real one fol
 position ("simulation in the loop"). The wrench of the real tool acts on the simulated
 arm, which makes this admittance control (Keemink et al. 2018, IJRR 37(11)):
 
-  M q'' = M clip(25 (v* - q'), +-1.2) + J^T F - [contact] J_t^T D_c J_t q'
+  M q'' = M clip(25 (v* - q'), +-1.2) + J^T f - s J_t^T D_c J_t q'
 
 M is the mass matrix, v* the policy's joint velocity, J the Jacobian of the flange and
-J_t that of the tool. F is the measured wrench after a low-pass filter of 20 Hz, less a
-dead zone of 5 N and 0.5 N m. In contact means: F is not zero.
+J_t that of the tool. F is the measured wrench after a low-pass filter of 20 Hz, and r
+its size in terms of what a free hand may read (``sensor.load``: 7.5 N and 0.6 N m).
 
-The dead zone is larger than the error of the sensor. Without it, the arm would drift:
-at rest, a few newtons move it. So the arm answers hits and jams, but not the force of a
-plate that it pushes. Its main use is that it moves as in training.
+  s = clip(r - 1, 0, 1)                    share of the damping
+  f = F / r * (integral of s from 1 to r)  felt wrench
+
+Up to r = 1, the sensor's error could be all of the wrench, and nothing is felt. Without
+that dead zone, the arm would drift: at rest, a few newtons move it. Beyond it, damping
+and the slope of f set in together, and are complete at r = 2. So no error within the
+accuracy slows a free arm; one of 8 N takes more than half of its speed. The arm answers
+hits and jams, but not the force of a plate that it pushes. Its main use is that it
+moves as in training.
 
 Stability: let k be the stiffness of what the tool touches, and tau the lag: the sum of
 all delays and time constants between the virtual position and F. A mode with damping B
 begins to oscillate with frequency w where B = k sin(w tau) / w, which is at most k tau.
 So every B > k tau is stable, for each mass. B is 25 m + D_c with the mass m that the
 tool feels along the contact; at the motors' limit of acceleration it is D_c alone. So
-D_c = 1.5 k tau is stable for walls of up to 1.5 k, whatever the policy commands. The
-damping is integrated implicitly, because it may exceed m / TIMESTEP.
+D_c = 1.5 k tau is stable for walls of up to 1.5 k, whatever the policy commands. Where
+the arm rests with s < 1, it feels the stiffness s k and has the damping s D_c, so the
+same walls are stable there. If the damping set in without the slope, the contact would
+buzz at the edge of the dead zone. The damping is integrated implicitly, because it may
+exceed m / TIMESTEP.
 """
 
 from __future__ import annotations
@@ -32,6 +41,7 @@ import numpy as np
 
 from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.limits import BRAKING, DEVIATION, TIMESTEP
+from apnpql_jax.robot.sensor import load
 from apnpql_jax.sim import motors
 
 CYCLE_MS = round(1e3 * TIMESTEP)
@@ -44,12 +54,6 @@ LEAD = 0.0016
 In a step of 5 ms from v with acceleration a, training moves by 5 v + 25 a, and parts of
 2, 2 and 1 ms move by 5 v + 17 a.
 """
-
-FORCE_DEAD_ZONE = 5.0
-"""N; the sensor's accuracy is about 4 N."""
-
-TORQUE_DEAD_ZONE = 0.5
-"""N m; the sensor's accuracy is about 0.3 N m."""
 
 FILTER_HZ = 20.0
 """Corner frequency of the wrench's low-pass filter, Hz."""
@@ -92,8 +96,8 @@ class VirtualArm:
     self.admittance = admittance
     self.position, self.velocity = np.zeros(6), np.zeros(6)
     """Joint angles f64[6] in rad, and velocities in rad/s."""
-    self.contact = False
-    """Whether the filtered wrench is beyond the dead zone."""
+    self.share = 0.0
+    """Share s of the damping: above 0 the filtered wrench is beyond the dead zone."""
     self._wrench, self._desired, self._motors = np.zeros(6), np.zeros(6), np.zeros(6)
     self._held_ms = 0
     self._smoothing = 1 - np.exp(-2 * np.pi * FILTER_HZ * TIMESTEP)
@@ -101,7 +105,7 @@ class VirtualArm:
   def reset(self, position: np.ndarray) -> None:
     """Starts again at rest at the measured joint angles f64[6], as after each pause."""
     self.synchronize(position, np.zeros(6))
-    self._wrench, self.contact, self._held_ms = np.zeros(6), False, 0
+    self._wrench, self.share, self._held_ms = np.zeros(6), 0.0, 0
 
   def synchronize(self, position: np.ndarray, velocity: np.ndarray) -> None:
     """Takes over joint angles and velocities f64[6] that the limits have changed."""
@@ -150,7 +154,7 @@ class VirtualArm:
   def _integrate(self, seconds: float, force: np.ndarray) -> None:
     """Advances by semi-implicit Euler, as MuJoCo does."""
     acceleration = self._motors
-    if self.contact:
+    if self.share:
       dynamics = self.model.dynamics(self.position, self.velocity)
       # Implicit Euler: (M + h D) (v' - v) = h (M a + J^T F - D v).
       damping = np.repeat(self._damping, 3)
@@ -165,24 +169,24 @@ class VirtualArm:
 
   @property
   def _damping(self) -> np.ndarray:
-    """D_c of translations (N s/m) and of rotations (N m s)."""
+    """Share of D_c: of translations (N s/m) and of rotations (N m s)."""
     assert self.admittance is not None
-    return self.admittance.damping * np.array([1.0, DAMPED_RADIUS**2])
+    return self.share * self.admittance.damping * np.array([1.0, DAMPED_RADIUS**2])
 
   def _felt(self, wrench: np.ndarray | None) -> np.ndarray:
-    """Returns the filtered wrench beyond the dead zone in the world, f64[6]."""
+    """Returns the felt wrench f in the world, f64[6], and sets the share s."""
     if self.admittance is None or wrench is None:
       return np.zeros(6)
     # A reading that is not finite is a fault of the sensor, not a contact.
     given = np.nan_to_num(np.asarray(wrench, float), posinf=0.0, neginf=0.0)
     self._wrench += self._smoothing * (given - self._wrench)
-    force, torque = (self.model.base_mat @ x for x in np.split(self._wrench, 2))
-    felt = _beyond(force, FORCE_DEAD_ZONE), _beyond(torque, TORQUE_DEAD_ZONE)
-    self.contact = any(x.any() for x in felt)
-    return np.concatenate(felt)
+    relative = load(self._wrench)
+    self.share, felt = ramp(relative)
+    return (self._wrench.reshape(2, 3) @ self.model.base_mat.T).ravel() * felt
 
 
-def _beyond(vector: np.ndarray, dead_zone: float) -> np.ndarray:
-  """Returns a vector shortened by a dead zone."""
-  length = np.linalg.norm(vector)
-  return vector * max(0.0, 1 - dead_zone / max(length, 1e-9))
+def ramp(relative: float) -> tuple[float, float]:
+  """Returns the share s at a wrench of ``relative`` size r, and f / F."""
+  share = min(max(relative - 1, 0.0), 1.0)
+  integral = share**2 / 2 + max(relative - 2, 0.0)
+  return share, integral / max(relative, 1.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import importlib
 import os
 from typing import Any
@@ -48,14 +49,21 @@ class View:
   """
 
   def __init__(
-    self, model: mujoco.MjModel, height: int, width: int, *, shadows: bool = True
+    self,
+    model: mujoco.MjModel,
+    height: int,
+    width: int,
+    *,
+    shadows: bool = True,
+    reflections: bool = True,
   ):
-    """Prepares images of a size; sets the model's size of off-screen buffers."""
+    """Prepares images of up to a size; sets the model's size of off-screen buffers."""
     model.vis.global_.offheight, model.vis.global_.offwidth = height, width
     self._model, self._size = model, (height, width)
     self._gl = off_screen(width, height)
     self._scene = mujoco.MjvScene(model, model.ngeom + 64)
     self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+    self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = reflections
     self._option = mujoco.MjvOption()
     self._option.sitegroup[:] = 0
     self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
@@ -72,19 +80,38 @@ class View:
 
   def draw(self, data: mujoco.MjData, camera: str) -> np.ndarray:
     """Returns the image u8[H, W, 3] of a camera of the model."""
+    return self.render(data, self._model.camera(camera).id, self._size)[0]
+
+  def render(
+    self,
+    data: mujoco.MjData,
+    camera: int,
+    size: tuple[int, int],
+    add: Callable[[mujoco.MjvScene], None] | None = None,
+  ) -> tuple[np.ndarray, np.ndarray]:
+    """Renders a camera of the model in a size of its own.
+
+    Args:
+      data: The state.
+      camera: Number of the camera.
+      size: Height and width, at most those of the view.
+      add: Adds geoms that are not in the model.
+
+    Returns:
+      The image u8[H, W, 3], and the depth f32[H, W], 1 where there is nothing.
+    """
     self._gl.make_current()
     view = mujoco.MjvCamera()
     view.type = mujoco.mjtCamera.mjCAMERA_FIXED
-    view.fixedcamid = self._model.camera(camera).id
+    view.fixedcamid = camera
     everything = mujoco.mjtCatBit.mjCAT_ALL
     mujoco.mjv_updateScene(
       self._model, data, self._option, None, view, everything, self._scene
     )
-    height, width = self._size
-    where, pixels = (
-      mujoco.MjrRect(0, 0, width, height),
-      np.zeros((*self._size, 3), "u1"),
-    )
+    if add is not None:
+      add(self._scene)
+    where = mujoco.MjrRect(0, 0, size[1], size[0])
+    pixels, depth = np.zeros((*size, 3), np.uint8), np.zeros(size, np.float32)
     mujoco.mjr_render(where, self._scene, self._context)
-    mujoco.mjr_readPixels(pixels, None, where, self._context)
-    return pixels[::-1]
+    mujoco.mjr_readPixels(pixels, depth, where, self._context)
+    return pixels[::-1], depth[::-1]

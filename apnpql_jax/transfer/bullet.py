@@ -78,7 +78,7 @@ class Bodies:
     self.robot = next(self.place[int(model.jnt_bodyid[j])][0] for j in self.joints)
 
   def reset(self, qpos: Any, mocap_pos: Any, mocap_quat: Any) -> None:
-    """Puts everything to a state of MuJoCo, at rest."""
+    """Puts everything to a state of MuJoCo, at rest; positions are in m and rad."""
     model = self.model
     for joint, link in self.joints.items():
       angle = float(qpos[model.jnt_qposadr[joint]])
@@ -91,7 +91,7 @@ class Bodies:
         self._put(root, qpos[first : first + 3], qpos[first + 3 : first + 7])
 
   def state(self) -> tuple[np.ndarray, np.ndarray]:
-    """Returns MuJoCo's qpos f64[nq] and qvel f64[nv]."""
+    """Returns MuJoCo's qpos f64[nq] and qvel f64[nv], in m, rad, m/s and rad/s."""
     model = self.model
     qpos, qvel = np.zeros(model.nq), np.zeros(model.nv)
     found = self.client.getJointStates(self.robot, list(self.joints.values()))
@@ -113,7 +113,7 @@ class Bodies:
     return qpos, qvel
 
   def pose(self, body: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns position f64[3] and rotation f64[3, 3] of a body of MuJoCo's model."""
+    """Returns position f64[3], m, and rotation f64[3, 3] of a body of the model."""
     loaded, link = self.place[int(body)]
     if link < 0:
       pos, quat = self._base(int(body))
@@ -138,6 +138,7 @@ class Bodies:
     self.client.resetBaseVelocity(loaded, [0, 0, 0], [0, 0, 0])
 
   def _load(self, root: int, path: Path) -> None:
+    """Loads the file of a tree of bodies and finds its links and joints."""
     client, model = self.client, self.model
     loaded = client.loadURDF(
       str(path),
@@ -156,6 +157,7 @@ class Bodies:
 
 
 def _number(name: bytes) -> int:
+  """Returns the id of MuJoCo in a name that ``urdf.write`` gave."""
   return int(name.decode().rsplit("_", 1)[1])
 
 

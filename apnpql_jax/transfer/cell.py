@@ -76,14 +76,14 @@ class Cell:
   def _latency_ms(self) -> int:
     return LATENCY_MS if self.latency_ms is None else self.latency_ms
 
-  def worlds(self, env: Env) -> Worlds | None:
+  def make_worlds(self, env: Env) -> Worlds | None:
     """Returns Bullet's worlds; None if the environment has the physics itself."""
     if self.physics != "bullet":
       return None
     latency_s = self._latency_ms / 1000
     return Worlds(env, latency_s=latency_s, admittance=self.admittance)
 
-  def renderer_of(self, env: Env) -> OpenGL | Tiny | None:
+  def make_renderer(self, env: Env) -> Renderer | None:
     """Returns what draws the images; None if the environment does itself."""
     draws = {"opengl": OpenGL, "tiny": Tiny}
     if self.renderer not in draws:

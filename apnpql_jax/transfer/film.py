@@ -38,7 +38,8 @@ def record(
     draw: Draws the images of the cell; the ray caster if None.
 
   Returns:
-    The written path, and the numbers of the two episodes: None where there is none.
+    ``video``: the written path; ``video_episodes``: the numbers of the two episodes,
+    None where there is none.
   """
   chosen = {True: first(played, success=True), False: first(played, success=False)}
   clips = [
@@ -50,7 +51,8 @@ def record(
   written = write_video(
     path, np.concatenate(clips), fps=1 / env.config.control_period_s
   )
-  return {"video": str(written), "success": chosen[True], "failure": chosen[False]}
+  numbers = {"success": chosen[True], "failure": chosen[False]}
+  return {"video": str(written), "video_episodes": numbers}
 
 
 def first(played: Sequence[Played], *, success: bool) -> int | None:

@@ -1,4 +1,4 @@
-"""What the renderers share: cameras, light and colors."""
+"""What the renderers share: cameras, light, colors, and the way to an image."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.render import Lighting
+from apnpql_jax.sim.graphics import area_resized
+from apnpql_jax.transfer import looks
 
 CAMERAS = ("global", "wrist")
 OVERSAMPLING = 2
@@ -15,31 +18,27 @@ OVERSAMPLING = 2
 
 
 class Light(NamedTuple):
-  """The light of a world without an unseen look."""
+  """The light of a world without an unseen look; colors are in [0, 1]."""
 
-  direction: np.ndarray  # f64[3], of travel
+  direction: np.ndarray  # f64[3], of travel, a unit vector
   ambient: float
   diffuse: float
-  background: Any  # color
+  background: Any  # color [3]
 
 
 def light_of(model: mujoco.MjModel, fields: dict[str, np.ndarray]) -> Light:
   """Returns the light of one world from its ``PhysicsState.fields``."""
   sun, plain = Lighting.from_model(model).id, Lighting()
-  direction = np.asarray(given(model, fields, "light_dir")[sun], float)
-  return Light(
-    direction / np.linalg.norm(direction),
-    float(fields["light_ambient"][sun][0])
-    if "light_ambient" in fields
-    else plain.ambient,
-    float(fields["light_diffuse"][sun][0])
-    if "light_diffuse" in fields
-    else plain.diffuse,
-    fields.get("background", plain.background),
-  )
+  levels = {"ambient": plain.ambient, "diffuse": plain.diffuse}
+  for name in levels:
+    if f"light_{name}" in fields:
+      levels[name] = float(fields[f"light_{name}"][sun][0])
+  direction = np.asarray(field_of(model, fields, "light_dir")[sun], float)
+  background = fields.get("background", plain.background)
+  return Light(direction / np.linalg.norm(direction), **levels, background=background)
 
 
-def given(
+def field_of(
   model: mujoco.MjModel, fields: dict[str, np.ndarray], name: str
 ) -> np.ndarray:
   """Returns a field of the model, or what one world has in its place."""
@@ -49,3 +48,28 @@ def given(
 def color_bytes(rgb: Any) -> np.ndarray:
   """Returns a color f64[3] in [0, 1] as u8[3]."""
   return (255 * np.asarray(rgb, float).clip(0, 1) + 0.5).astype(np.uint8)
+
+
+def rendered_sizes(config: EnvConfig) -> list[tuple[int, int]]:
+  """Returns height and width, in pixels, in which each camera is rendered."""
+  sizes = config.global_size, config.wrist_size
+  return [(OVERSAMPLING * height, OVERSAMPLING * width) for height, width in sizes]
+
+
+def developed(
+  pixels: np.ndarray, look: looks.Look | None, row: int, instant: int, camera: int
+) -> np.ndarray:
+  """Returns the agent's image of rendered pixels, u8[H, W, 3].
+
+  Args:
+    pixels: u8[OVERSAMPLING H, OVERSAMPLING W, 3].
+    look: Adds the faults of a camera, if any.
+    row: Row of the reset bank.
+    instant: Instant of the episode; it decides on the noise, together with ``row``.
+    camera: Index in ``CAMERAS``.
+  """
+  image = area_resized(pixels, OVERSAMPLING)
+  if look is None:
+    return image
+  rng = np.random.default_rng([looks.VERSION, row, instant, camera])
+  return looks.photograph(image, look, camera, rng)

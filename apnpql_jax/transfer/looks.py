@@ -1,11 +1,11 @@
-"""Unseen looks: worlds for the eyes that domain randomization cannot draw.
+"""Unseen looks: appearances of the world that domain randomization cannot draw.
 
-They were fixed before any policy was trained for them and are never tuned: a change of
-what this file draws is a new ``VERSION``. Randomization draws plain, checkered and wavy
-surfaces, one white light without shadows of objects, and no noise. Here are grained
-surfaces, two colored lights with shadows and highlights, objects that belong to no
-task, and the faults of a camera. Everything is a function of the version and of the row
-of the reset bank.
+They were fixed before any policy was trained for them, and they are never tuned: a
+change of what this file draws needs a new ``VERSION``. Randomization draws plain,
+checkered and wavy surfaces, one white light without shadows of objects, and no noise.
+Unseen looks have grained surfaces, two colored lights with shadows and highlights,
+objects that belong to no task, and the faults of a camera. Everything is a function of
+the version and of the row of the reset bank.
 """
 
 from __future__ import annotations
@@ -66,7 +66,12 @@ class Look:
 
 @functools.lru_cache(maxsize=256)
 def draw(row: int, bodies: int) -> Look:
-  """Draws the look of the world at a row of the reset bank."""
+  """Returns the look of the world at a row of the reset bank.
+
+  Args:
+    row: The row.
+    bodies: Number of bodies of the model.
+  """
   rng = np.random.default_rng([VERSION, row])
   warm = rng.uniform(-1, 1)
   tint = np.array([1.0 + 0.18 * warm, 1.0, 1.0 - 0.18 * warm])
@@ -152,7 +157,14 @@ def surface_texture(index: int) -> np.ndarray:
 def photograph(
   image: np.ndarray, look: Look, camera: int, rng: np.random.Generator
 ) -> np.ndarray:
-  """Adds the faults of a camera to an image u8[H, W, 3]."""
+  """Adds the faults of a camera to an image.
+
+  Args:
+    image: u8[H, W, 3].
+    look: What decides on color, vignetting, blur and noise.
+    camera: Index of the camera.
+    rng: Source of the noise.
+  """
   x = (image.astype(np.float64) / 255) ** look.gamma
   padded = np.pad(x, ((1, 1), (1, 1), (0, 0)), mode="edge")
   around = padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:]
@@ -175,6 +187,6 @@ def _smooth(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
 
 
 def _blend(mix: np.ndarray, *ends: Sequence[float]) -> np.ndarray:
-  """Returns u8[H, W, 3] between the two colors at the ends."""
+  """Returns u8[H, W, 3] between two colors in [0, 1], by a share f64[H, W]."""
   low, high = np.array(ends)
   return (255 * (low + mix.clip(0, 1)[..., None] * (high - low))).astype(np.uint8)

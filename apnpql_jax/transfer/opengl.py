@@ -14,21 +14,24 @@ import numpy as np
 
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.render import Lighting
-from apnpql_jax.sim.graphics import area_resized, off_screen
+from apnpql_jax.sim.graphics import View
 from apnpql_jax.sim.scene import Scene, compile_file
 from apnpql_jax.transfer import looks
 from apnpql_jax.transfer.graphics import (
   CAMERAS,
-  OVERSAMPLING,
   color_bytes,
+  developed,
   light_of,
+  rendered_sizes,
 )
 
 SHADOW_SIZE = 512
 """Side of shadow maps in pixels."""
 
 _LAMP = "transfer_lamp"
-_WALLS = 4.0  # m, distance of the backdrop
+_WALLS_M = 4.0  # distance of the backdrop, m
+_VARIED = ("geom_rgba", "geom_size", "geom_matid", "cam_fovy")
+"""Fields of the model that differ between worlds or looks."""
 
 
 class OpenGL:
@@ -40,112 +43,68 @@ class OpenGL:
     Raises:
       ConfigError: No graphics library can be loaded.
     """
-    sizes = config.global_size, config.wrist_size
-    self._sizes = [(OVERSAMPLING * h, OVERSAMPLING * w) for h, w in sizes]
+    self._sizes, self._unseen = rendered_sizes(config), unseen
     self.model = model = _with_textures(scene)
-    self._plain = {
-      name: getattr(model, name).copy()
-      for name in ("geom_rgba", "geom_size", "geom_matid", "cam_fovy")
-    }
+    self._plain = {name: getattr(model, name).copy() for name in _VARIED}
     self._data = mujoco.MjData(model)
     mujoco.mj_forward(model, self._data)  # Places the lights.
     self._cameras = [scene.id("camera", name) for name in CAMERAS]
     self._sun = Lighting.from_model(scene.model).id
     self._lamp = model.light(_LAMP).id
-    self._materials = [
-      model.material(_name("table", i)).id for i in range(looks.TABLES)
-    ]
-    self._surfaces = [
-      model.material(_name("surface", i)).id for i in range(looks.SURFACES)
-    ]
-    self._unseen = unseen
-    model.light_castshadow[
-      self._sun
-    ] = not unseen  # Only the lamp does, which is faster.
-    height, width = np.max(self._sizes, axis=0)
-    model.vis.global_.offheight, model.vis.global_.offwidth = height, width
+    # With unseen looks, only the lamp casts shadows, which is faster.
+    model.light_castshadow[self._sun] = not unseen
+    self._tables, self._surfaces = (
+      [model.material(_name(kind, i)).id for i in range(count)]
+      for kind, count in (("table", looks.TABLES), ("surface", looks.SURFACES))
+    )
     model.vis.quality.offsamples = 0  # Oversampled instead.
     model.vis.quality.shadowsize = SHADOW_SIZE
-    self._gl = off_screen(int(width), int(height))
-    self._scene = mujoco.MjvScene(model, model.ngeom + 64)
-    self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = unseen or config.shadows
-    self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
-    self._option = mujoco.MjvOption()
-    self._option.sitegroup[:] = 0
-    self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+    height, width = map(int, np.max(self._sizes, axis=0))
+    shadows = unseen or config.shadows
+    self._view = View(model, height, width, shadows=shadows, reflections=False)
 
   def __enter__(self) -> OpenGL:
     return self
 
   def __exit__(self, *error: object) -> None:
-    """Frees the graphics, which the end of Python would do too late."""
-    self._gl.make_current()
-    self._context.free()
-    self._gl.free()
+    """Frees the graphics."""
+    self._view.__exit__(*error)
 
   def draw(
     self,
     poses: dict[str, np.ndarray],
     fields: dict[str, np.ndarray],
     row: int,
-    time: int,
+    instant: int,
   ) -> list[np.ndarray]:
     """Returns the images u8[H, W, 3] of the global and the wrist camera.
 
     Args:
-      poses: Those of ``Kinematics`` of one world.
+      poses: Those of ``Kinematics`` of one world, in m.
       fields: Its ``PhysicsState.fields``.
       row: Its row of the reset bank, which decides on unseen looks.
-      time: Instant of the episode, which decides on their noise.
+      instant: Instant of the episode, which decides on their noise.
     """
-    self._gl.make_current()
     for name, value in poses.items():
       target = getattr(self._data, name)
       target[...] = value.reshape(target.shape)
     look = looks.draw(row, self.model.nbody) if self._unseen else None
     background = self._dress(fields, look)
     images = []
-    for index, (height, width) in enumerate(self._sizes):
-      camera = mujoco.MjvCamera()
-      camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-      camera.fixedcamid = self._cameras[index]
-      mujoco.mjv_updateScene(
-        self.model,
-        self._data,
-        self._option,
-        None,
-        camera,
-        mujoco.mjtCatBit.mjCAT_ALL,
-        self._scene,
+    for index, camera in enumerate(self._cameras):
+      pixels, depth = self._view.render(
+        self._data, camera, self._sizes[index], lambda scene: self._add(scene, look)
       )
-      if look:
-        self._add_walls(background)
-      for thing in look.clutter if look else ():
-        self._add(thing.shape, thing.size, thing.pos, thing.mat, thing.rgb)
-        self._scene.geoms[self._scene.ngeom - 1].matid = self._surfaces[thing.surface]
-      view, pixels = (
-        mujoco.MjrRect(0, 0, width, height),
-        np.zeros((height, width, 3), "u1"),
-      )
-      mujoco.mjr_render(view, self._scene, self._context)
-      depth = np.zeros((height, width), np.float32)
-      mujoco.mjr_readPixels(pixels, depth, view, self._context)
-      if not look:  # Walls would be lit.
+      if look is None:  # The walls of an unseen look have its color.
         pixels[depth == 1.0] = color_bytes(background)
-      image = area_resized(pixels[::-1], OVERSAMPLING)
-      if look:
-        rng = np.random.default_rng([looks.VERSION, row, time, index])
-        image = looks.photograph(image, look, index, rng)
-      images.append(image)
+      images.append(developed(pixels, look, row, instant, index))
     return images
 
   def _dress(self, fields: dict[str, np.ndarray], look: looks.Look | None) -> Any:
     """Sets surfaces and lights; returns the color of the background."""
     model, data = self.model, self._data
-    given = {**self._plain, **{k: x for k, x in fields.items() if k in self._plain}}
-    for name in ("geom_rgba", "geom_size", "geom_matid", "cam_fovy"):
-      getattr(model, name)[...] = given[name]
+    for name, plain in self._plain.items():
+      getattr(model, name)[...] = fields.get(name, plain)
     light = light_of(model, fields)
     data.light_xdir[self._sun] = light.direction
     model.vis.headlight.diffuse[:] = model.vis.headlight.specular[:] = 0
@@ -163,25 +122,34 @@ class OpenGL:
     table = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
     model.geom_rgba[table, :3] = look.table_rgb
     surfaces = np.array(self._surfaces)[look.surfaces[model.geom_bodyid]]
-    model.geom_matid[:] = np.where(table, self._materials[look.table], surfaces)
+    model.geom_matid[:] = np.where(table, self._tables[look.table], surfaces)
     return look.backdrop
 
-  def _add_walls(self, rgb: Any) -> None:
-    """Surrounds the scene by walls that shine in one color."""
+  def _add(self, scene: mujoco.MjvScene, look: looks.Look | None) -> None:
+    """Adds what an unseen look has around the workspace."""
+    if look is None:
+      return
     for axis in range(2):
       for side in (-1, 1):
-        pos, size = np.zeros(3), np.full(3, _WALLS)
-        pos[axis], size[axis] = side * _WALLS, 0.01
-        self._add(mujoco.mjtGeom.mjGEOM_BOX, size, pos, np.eye(3).ravel(), rgb)
-        wall = self._scene.geoms[self._scene.ngeom - 1]
-        wall.emission, wall.specular = 1.0, 0.0
-        wall.rgba[:3] = rgb
+        pos, size = np.zeros(3), np.full(3, _WALLS_M)
+        pos[axis], size[axis] = side * _WALLS_M, 0.01
+        box, upright = mujoco.mjtGeom.mjGEOM_BOX, np.eye(3).ravel()
+        wall = _add_geom(scene, box, size, pos, upright, look.backdrop)
+        wall.emission, wall.specular = 1.0, 0.0  # It shines in its color.
+    for thing in look.clutter:
+      geom = _add_geom(scene, thing.shape, thing.size, thing.pos, thing.mat, thing.rgb)
+      geom.matid = self._surfaces[thing.surface]
 
-  def _add(self, shape: int, size: Any, pos: Any, mat: Any, rgb: Any) -> None:
-    geom = self._scene.geoms[self._scene.ngeom]
-    rgba = np.append(rgb, 1.0).astype(np.float32)
-    mujoco.mjv_initGeom(geom, shape, size, pos, mat, rgba)
-    self._scene.ngeom += 1
+
+def _add_geom(
+  scene: mujoco.MjvScene, shape: int, size: Any, pos: Any, mat: Any, rgb: Any
+) -> mujoco.MjvGeom:
+  """Adds a geom that is not in the model; sizes and positions are in m."""
+  geom = scene.geoms[scene.ngeom]
+  rgba = np.append(rgb, 1.0).astype(np.float32)
+  mujoco.mjv_initGeom(geom, shape, size, pos, mat, rgba)
+  scene.ngeom += 1
+  return geom
 
 
 def _with_textures(scene: Scene) -> mujoco.MjModel:

@@ -23,7 +23,7 @@ from apnpql_jax.sim.physics import OWN_FIELDS
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.transfer import bullet, contacts
 
-ITERATIONS = 300
+SOLVER_ITERATIONS = 300
 """Iterations of Bullet's solver, which makes a step of 2 ms per command of the servos.
 
 With 100, a cup creeps between the pads and slowly pushes the hand open.
@@ -53,7 +53,7 @@ With none, the solver is far from converged in a grip, and the gears give way.
 GEAR_ERP = 0.2
 """Share of a gear's error that Bullet removes in a step."""
 
-REFRESH = 75
+REFRESH_CYCLES = 75
 """Cycles after which Bullet finds the contacts of the hand again: 0.15 s."""
 
 
@@ -61,7 +61,13 @@ class Plant:
   """One world; ``begin`` starts an episode."""
 
   def __init__(self, scene: Scene, *, latency_s: float, admittance: bool):
-    """Opens a simulator."""
+    """Opens a simulator.
+
+    Args:
+      scene: The scene of a task.
+      latency_s: Time from the virtual arm to the servos, s.
+      admittance: Whether the virtual arm yields to the wrench at the tool.
+    """
     self.scene = scene
     self._client = bullet.connect()
     self._delay = round(latency_s / TIMESTEP)
@@ -80,14 +86,21 @@ class Plant:
   def begin(
     self, qpos: Any, mocap_pos: Any, mocap_quat: Any, fields: dict[str, np.ndarray]
   ) -> None:
-    """Builds the world of an episode, with its own ``PhysicsState.fields``."""
+    """Builds the world of an episode.
+
+    Args:
+      qpos: Configuration f64[nq], in the units of MuJoCo.
+      mocap_pos: Positions of the mocap bodies f64[nmocap, 3], m.
+      mocap_quat: Their rotations f64[nmocap, 4].
+      fields: The world's own ``PhysicsState.fields``.
+    """
     client, scene = self._client, self.scene
     self._fields = fields
     model = with_fields(scene.model, fields)
     client.resetSimulation()
     client.setGravity(*model.opt.gravity)
     client.setPhysicsEngineParameter(
-      fixedTimeStep=TIMESTEP, numSolverIterations=ITERATIONS
+      fixedTimeStep=TIMESTEP, numSolverIterations=SOLVER_ITERATIONS
     )
     self.bodies = bodies = bullet.Bodies(client, model)
     bodies.reset(qpos, mocap_pos, mocap_quat)
@@ -101,11 +114,11 @@ class Plant:
       if loaded == bodies.robot and body > self._flange_body
     }
     self._finger = bodies.joints[finger]
-    self._touch(model)
-    self._burden(model)
+    self._set_contacts(model)
+    self._add_finger_inertia(model)
     others = [link for j, link in bodies.joints.items() if j > finger]
-    self._couple(others)
-    self._still([*self._arm, *others])
+    self._add_gears(others)
+    self._release_brakes([*self._arm, *others])
     angles = np.asarray(qpos, float)[scene.arm_qpos]
     self._virtual.reset(angles)
     # The command before the present one gives its speed.
@@ -115,13 +128,19 @@ class Plant:
     self._last = np.zeros(6), float(qpos[scene.gripper_qpos] > 0.5)
 
   def step(self, velocity: np.ndarray, close: float, period_s: float) -> None:
-    """Runs a control period with desired joint velocities f64[6], rad/s."""
+    """Runs a control period.
+
+    Args:
+      velocity: Desired joint velocities f64[6], rad/s.
+      close: Command of the gripper, 1 to close and 0 to open.
+      period_s: Length of the period, s.
+    """
     late = float(self._fields.get("control_delay", 0.0)) * self.scene.model.opt.timestep
     now = (np.asarray(velocity, float), float(close))
     for command in range(round(period_s / TIMESTEP)):
       self._cycles += 1
-      if self._cycles % REFRESH == 0:
-        self._forget_contacts()
+      if self._cycles % REFRESH_CYCLES == 0:
+        self._renew_contacts()
       self._drive(*(self._last if command * TIMESTEP < late else now))
       self._client.stepSimulation()
       states = self._client.getJointStates(self.bodies.robot, self._arm)
@@ -129,7 +148,10 @@ class Plant:
     self._last = now
 
   def wrench(self) -> np.ndarray:
-    """Returns the contact wrench on the hand, f64[6], see ``protocols.ArmState``."""
+    """Returns the contact wrench on the hand f64[6], N and N m.
+
+    See ``protocols.ArmState`` for its frame.
+    """
     pos, mat = self.bodies.pose(self._flange_body)
     flange = pos + mat @ self.bodies.model.site(FLANGE).pos
     force, torque = np.zeros(3), np.zeros(3)
@@ -177,7 +199,7 @@ class Plant:
       force=self._limit[6],
     )
 
-  def _forget_contacts(self) -> None:
+  def _renew_contacts(self) -> None:
     """Lets Bullet find the contacts of the hand again.
 
     It keeps the normals of contacts that last in the axes of the world. When the hand
@@ -187,10 +209,11 @@ class Plant:
       self._client.setCollisionFilterGroupMask(self.bodies.robot, link, 1, -1)
 
   def _finger_rate(self, angle: float, close: float) -> float:
+    """Returns the speed of the driven finger at an angle in rad, rad/s."""
     speed = float(self._fields.get("gripper_speed", motors.GRIPPER_SPEED))
     return float(motors.finger_rate(np.float64(angle), close, np, speed=speed))
 
-  def _touch(self, model: mujoco.MjModel) -> None:
+  def _set_contacts(self, model: mujoco.MjModel) -> None:
     """Sets what decides on contacts, and the damping of joints."""
     sliding, spinning = contacts.sliding(model), contacts.spinning(model)
     for body, (loaded, link) in self.bodies.place.items():
@@ -208,7 +231,7 @@ class Plant:
         jointDamping=float(model.dof_damping[dof]) if hinge else 0.0,
       )
 
-  def _burden(self, model: mujoco.MjModel) -> None:
+  def _add_finger_inertia(self, model: mujoco.MjModel) -> None:
     """Adds a share of the fingers' armature, which Bullet lacks, to their links."""
     for joint, link in self.bodies.joints.items():
       body = int(model.jnt_bodyid[joint])
@@ -225,7 +248,7 @@ class Plant:
         localInertiaDiagonal=(model.body_inertia[body] + extra).tolist(),
       )
 
-  def _couple(self, others: list[int]) -> None:
+  def _add_gears(self, others: list[int]) -> None:
     """Lets the driven finger move the others."""
     for link in others:
       gear = self._client.createConstraint(
@@ -242,8 +265,8 @@ class Plant:
         gear, gearRatio=-1, maxForce=GEAR_FORCE, erp=GEAR_ERP
       )
 
-  def _still(self, links: list[int]) -> None:
-    """Takes out the brakes that PyBullet puts into every joint."""
+  def _release_brakes(self, links: list[int]) -> None:
+    """Removes the brakes that PyBullet puts into every joint."""
     for link in links:
       self._client.setJointMotorControl2(
         self.bodies.robot, link, self._client.VELOCITY_CONTROL, force=0

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -28,11 +29,10 @@ Draw = Callable[
 the global and the wrist camera."""
 
 Act = Callable[[EnvState, Observation, PRNGKeyArray], Array]
-"""(worlds, observation, key) -> actions f32[worlds, 7]."""
-
+"""(worlds, observation, key) -> actions f32[worlds, 7], as of ``Env.step``."""
 
 Advance = Callable[[EnvState, Array, np.ndarray], Arrival]
-"""(worlds, actions f32[worlds, 7], worlds that still run) -> a control period later."""
+"""(worlds, actions f32[worlds, 7], worlds that still run) -> a period later."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,6 +47,12 @@ class Played:
   """The worlds at the first instant."""
   qpos: np.ndarray
   """Their configurations at every instant, f32[time, worlds, nq]."""
+
+  def without_last(self, count: int) -> Played:
+    """Returns the episodes but the last ones, whose states stay."""
+    kept = len(self.success) - count
+    names = "success", "length", "stages", "rows"
+    return dataclasses.replace(self, **{x: getattr(self, x)[:kept] for x in names})
 
 
 def play(
@@ -73,7 +79,6 @@ def play(
   count = len(rows)
   running, success = np.ones(count, bool), np.zeros(count, bool)
   length, stages = np.zeros(count, np.int32), []
-  watch = jax.jit(lambda state: expert_stage(env, state))
   state, recent, qpos = env.reset(rows), None, []
   start = state.physics
   for time in range(env.config.episode_steps + 1):
@@ -82,7 +87,7 @@ def play(
     length = np.where(running, np.asarray(state.elapsed), length)
     running = running & ~np.asarray(state.timestep.last)
     qpos.append(np.asarray(state.physics.qpos))
-    stages.append(np.where(running, np.asarray(watch(state)), -1))
+    stages.append(np.where(running, np.asarray(_stage(env, state)), -1))
     if not running.any():
       break
     seen = state.observation
@@ -101,6 +106,12 @@ def play(
   active = np.stack(stages)
   kept = [x[x >= 0] for x in active.T]
   return Played(success, length, kept, np.asarray(rows), start, np.stack(qpos))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _stage(env: Env, state: EnvState) -> Array:
+  """Returns ``expert_stage``, with one trace for all batches of an environment."""
+  return expert_stage(env, state)
 
 
 def with_images(observation: Observation, images: tuple[Array, Array]) -> Observation:

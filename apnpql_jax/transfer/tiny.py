@@ -21,21 +21,22 @@ from scipy.spatial.transform import Rotation
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.render import Geoms
-from apnpql_jax.sim.graphics import area_resized
 from apnpql_jax.sim.scene import Scene
+from apnpql_jax.training.evaluate import MAX_WORLDS
 from apnpql_jax.transfer import looks
 from apnpql_jax.transfer.bullet import connect
 from apnpql_jax.transfer.graphics import (
   CAMERAS,
-  OVERSAMPLING,
   color_bytes,
-  given,
+  developed,
+  field_of,
   light_of,
+  rendered_sizes,
 )
 from apnpql_jax.transfer.shapes import shape
 
-KEPT = 64
-"""Worlds that stay loaded."""
+KEPT = MAX_WORLDS
+"""Worlds that stay loaded: as many as are played in parallel."""
 
 _NEAR, _FAR = 0.01, 10.0  # m
 _LIGHT_M = 3.0  # m, where the light stands for its shadows
@@ -50,8 +51,7 @@ class Tiny:
     Raises:
       ConfigError: The scene has meshes.
     """
-    sizes = config.global_size, config.wrist_size
-    self._sizes = [(OVERSAMPLING * h, OVERSAMPLING * w) for h, w in sizes]
+    self._sizes = rendered_sizes(config)
     self._model, self._geoms = scene.model, Geoms.from_model(scene.model)
     if (self._geoms.types == mujoco.mjtGeom.mjGEOM_MESH).any():
       raise ConfigError(f"{scene.name}.xml has meshes, which --renderer tiny lacks")
@@ -74,51 +74,49 @@ class Tiny:
     poses: dict[str, np.ndarray],
     fields: dict[str, np.ndarray],
     row: int,
-    time: int,
+    instant: int,
   ) -> list[np.ndarray]:
     """Returns the images u8[H, W, 3] of the global and the wrist camera.
 
     The arguments are those of ``OpenGL.draw``.
     """
     look = looks.draw(row, self._model.nbody) if self._unseen else None
-    sizes = given(self._model, fields, "geom_size")
-    world = self._world_of(sizes, row, look)
+    world = self._world_of(field_of(self._model, fields, "geom_size"), row, look)
     world.place(poses["geom_xpos"], poses["geom_xmat"])
     if look is None:
-      world.color(given(self._model, fields, "geom_rgba"))
-    light = light_of(self._model, fields)
-    lighting = {
-      "lightDirection": (-light.direction).tolist(),
-      "lightColor": [1.0, 1.0, 1.0],
-      "lightAmbientCoeff": light.ambient,
-      "lightDiffuseCoeff": light.diffuse,
-      "lightSpecularCoeff": 0.0,
-    }
-    background = light.background
-    if look:
-      brightness = float(look.sun_rgb.max())
-      background = look.backdrop
-      lighting = {
-        "lightDirection": (-look.sun_dir).tolist(),
-        "lightColor": (look.sun_rgb / brightness).tolist(),
-        "lightAmbientCoeff": look.ambient,
-        "lightDiffuseCoeff": brightness,
-        "lightSpecularCoeff": look.specular,
-      }
-    lighting |= {"lightDistance": _LIGHT_M, "shadow": int(self._shadows)}
-    angles, images = given(self._model, fields, "cam_fovy"), []
+      world.color(field_of(self._model, fields, "geom_rgba"))
+    background, lighting = self._lighting(fields, look)
+    angles, images = field_of(self._model, fields, "cam_fovy"), []
     for index, camera in enumerate(self._cameras):
       eye, mat = (poses[name][camera] for name in ("cam_xpos", "cam_xmat"))
-      image = world.image(
+      pixels = world.image(
         self._sizes[index], eye, np.reshape(mat, (3, 3)), angles[camera], lighting
       )
-      image = np.where(image[..., 3:] > 0, image[..., :3], color_bytes(background))
-      image = area_resized(image.astype(np.uint8), OVERSAMPLING)
-      if look:
-        rng = np.random.default_rng([looks.VERSION, row, time, index])
-        image = looks.photograph(image, look, index, rng)
-      images.append(image)
+      pixels = np.where(pixels[..., 3:] > 0, pixels[..., :3], color_bytes(background))
+      images.append(developed(pixels.astype(np.uint8), look, row, instant, index))
     return images
+
+  def _lighting(
+    self, fields: dict[str, np.ndarray], look: looks.Look | None
+  ) -> tuple[Any, dict[str, Any]]:
+    """Returns the color of the background, and arguments of ``getCameraImage``."""
+    if look is None:
+      light = light_of(self._model, fields)
+      background, direction = light.background, light.direction
+      color, ambient, diffuse = [1.0, 1.0, 1.0], light.ambient, light.diffuse
+    else:
+      background, direction = look.backdrop, look.sun_dir
+      ambient, diffuse = look.ambient, float(look.sun_rgb.max())
+      color = (look.sun_rgb / diffuse).tolist()
+    return background, {
+      "lightDirection": (-direction).tolist(),
+      "lightColor": color,
+      "lightAmbientCoeff": ambient,
+      "lightDiffuseCoeff": diffuse,
+      "lightSpecularCoeff": look.specular if look else 0.0,
+      "lightDistance": _LIGHT_M,
+      "shadow": int(self._shadows),
+    }
 
   def _world_of(
     self, sizes: np.ndarray, row: int | None, look: looks.Look | None
@@ -161,12 +159,12 @@ class _World:
       self._put(body, thing.pos, thing.mat)
 
   def place(self, pos: np.ndarray, mat: np.ndarray) -> None:
-    """Moves the geoms to poses by MuJoCo's ids."""
+    """Moves the geoms to positions f64[ngeom, 3], m, and rotations f64[ngeom, 9]."""
     for body, geom in zip(self._bodies, self._ids, strict=True):
       self._put(body, pos[geom], mat[geom])
 
   def color(self, rgba: np.ndarray) -> None:
-    """Changes the colors of geoms, by MuJoCo's ids."""
+    """Changes the colors of geoms to rgba f32[ngeom, 4], in [0, 1]."""
     for body, geom in zip(self._bodies, self._ids, strict=True):
       color = (*rgba[geom, :3].tolist(), 1.0)
       if self._colors.get(body) != color:
@@ -181,7 +179,15 @@ class _World:
     fovy: float,
     lighting: dict[str, Any],
   ) -> np.ndarray:
-    """Returns RGB and whether something is there, u8[H, W, 4]."""
+    """Returns RGB and whether something is there, u8[H, W, 4].
+
+    Args:
+      size: Height and width in pixels.
+      eye: Position of the camera f64[3], m.
+      mat: Its rotation f64[3, 3], in MuJoCo's convention.
+      fovy: Vertical field of view, degrees.
+      lighting: Arguments of ``getCameraImage``.
+    """
     client, (height, width) = self.client, size
     ahead, up = eye - mat[:, 2], mat[:, 1]
     lens = (float(fovy), width / height, _NEAR, _FAR)

@@ -1,8 +1,8 @@
 """Held-out episodes of a policy or of the expert in worlds that training did not have.
 
 A cell is a choice of physics, renderer and looks. The expert acts on privileged poses,
-so that its success depends on the physics alone. Where it fails, a cell is no evidence
-about a policy.
+so its success depends on the physics alone. Where the expert fails, a cell is no
+evidence about a policy.
 """
 
 from __future__ import annotations
@@ -20,14 +20,13 @@ import numpy as np
 
 from apnpql_jax import devices
 from apnpql_jax.config.checks import ACTING
-from apnpql_jax.config.schema import EnvConfig, TrainConfig
+from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.console import reporting
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.envs.state import EnvState
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs import checkpoint_reader, run_folder
 from apnpql_jax.runs.metrics import wilson_interval
-from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.training.diagnose import end_of
 from apnpql_jax.training.evaluate import (
@@ -38,6 +37,7 @@ from apnpql_jax.training.evaluate import (
 )
 from apnpql_jax.transfer import film
 from apnpql_jax.transfer.cell import Cell, Renderer
+from apnpql_jax.transfer.conditions import of_expert, of_run
 from apnpql_jax.transfer.play import Act, Draw, Played, play
 from apnpql_jax.types import Array
 
@@ -59,12 +59,20 @@ def transfer(
 ) -> dict[str, Any]:
   """Plays held-out episodes of a cell with a checkpoint of a run.
 
-  ``step`` and ``acting`` are as in ``evaluate``. ``video`` is the file for a video of
-  the first success and the first failure.
+  Args:
+    run_dir: The run folder.
+    cell: The worlds.
+    episodes: Number of episodes.
+    seed: Random seed of the episodes and of the policy.
+    step: Step of the checkpoint; the newest if None.
+    acting: Rule that chooses actions, see ``agents/acting.py``; that of the run's
+      evaluations if None.
+    video: File for a video of the first success and the first failure.
 
   Returns:
-    Success rate with its Wilson interval, and failures by their last stage, as in
-    ``diagnose``.
+    The conditions, see ``conditions.of_run``; the success rate with its Wilson
+    interval; the mean length in control periods; failures by their last stage, as in
+    ``diagnose``; and the time that it took, s.
 
   Raises:
     ConfigError: An argument is invalid, or a package or library is missing.
@@ -87,8 +95,11 @@ def transfer(
   obs = "state" if outside else "pixels"  # Others draw the images.
   env = _make_env(config.env, cell, obs, instants=0 if outside else instants)
   agent, params, step = load_agent(run_dir, config, env.task, step=step)
-  acting = acting or config.eval_acting
-  choose = jax.jit(lambda p, seen, key: agent.act(p, seen, key, acting=acting)[0])
+  conditions = of_run(
+    run_dir, config, step, cell, acting=acting, episodes=episodes, seed=seed
+  )
+  rule = conditions["acting"]
+  choose = jax.jit(lambda p, seen, key: agent.act(p, seen, key, acting=rule)[0])
 
   def act(state: EnvState, seen: Any, key: Array) -> Array:
     del state
@@ -99,8 +110,7 @@ def transfer(
     instants = instants if draw else 0
     played = _play_all(env, cell, act, episodes, seed, draw=draw, instants=instants)
     filmed = _filmed(env, played, video, draw)
-  about = {"checkpoint_step": step, "acting": acting, "trained": _training(config)}
-  return _summary(config.env.task, cell, about, played, began) | filmed
+  return _summary(conditions, played, began) | filmed
 
 
 def transfer_expert(
@@ -130,13 +140,13 @@ def transfer_expert(
   with contextlib.ExitStack() as stack:
     draw = _draw_of(env, cell, stack) if video else None
     filmed = _filmed(env, played, video, draw)
-  found = _summary(env_config.task, cell, {"algorithm": "expert"}, played, began)
+  conditions = of_expert(env_config, cell, episodes=episodes, seed=seed)
+  found = _summary(conditions, played, began)
   return found | filmed | {"sufficient": found["success_rate"] >= EXPERT_SUFFICES}
 
 
 def make_draw(env: Env, renderer: Renderer) -> Draw:
   """Returns a function that draws all running worlds; others stay black."""
-  poses_of = make_kinematics(env.task.scene)
   sizes = env.config.global_size, env.config.wrist_size
 
   def draw(
@@ -145,7 +155,7 @@ def make_draw(env: Env, renderer: Renderer) -> Draw:
     running: np.ndarray,
     instants: int | np.ndarray,
   ) -> tuple[Array, Array]:
-    kinematics, instants = poses_of(state), np.broadcast_to(instants, len(rows))
+    kinematics, instants = env.poses(state), np.broadcast_to(instants, len(rows))
     poses = {name: np.asarray(getattr(kinematics, name)) for name in _POSES}
     fields = {name: np.asarray(x) for name, x in state.fields.items()}
     images = [np.zeros((len(rows), *size, 3), np.uint8) for size in sizes]
@@ -166,7 +176,7 @@ def make_draw(env: Env, renderer: Renderer) -> Draw:
 
 def _draw_of(env: Env, cell: Cell, stack: contextlib.ExitStack) -> Draw | None:
   """Returns what draws the images; None if the environment does itself."""
-  outside = cell.renderer_of(env)
+  outside = cell.make_renderer(env)
   return make_draw(env, stack.enter_context(outside)) if outside else None
 
 
@@ -195,34 +205,30 @@ def _make_env(config: EnvConfig, cell: Cell, obs: str, *, instants: int) -> Env:
 def _play_all(
   env: Env, cell: Cell, act: Act, episodes: int, seed: int, **options: Any
 ) -> list[Played]:
+  """Plays batches of episodes; the last one has no more than are asked for."""
   with contextlib.ExitStack() as stack:
-    if worlds := cell.worlds(env):
+    if worlds := cell.make_worlds(env):
       options["advance"] = stack.enter_context(worlds).advance
-    return [
+    played = [
       play(env, act, rows, key, **options)
       for rows, key in held_out_batches(env, episodes=episodes, seed=seed)
     ]
-
-
-def _training(config: TrainConfig) -> str:
-  return "randomized" if config.env.randomize else "plain"
+  excess = sum(len(batch.success) for batch in played) - episodes
+  return [*played[:-1], played[-1].without_last(excess)]
 
 
 def _summary(
-  task: str, cell: Cell, about: dict[str, Any], played: list[Played], began: float
+  conditions: dict[str, Any], played: list[Played], began: float
 ) -> dict[str, Any]:
-  episodes = sum(len(x.success) for x in played)
+  """Returns the conditions with the figures; ``began`` is a monotonic time, s."""
   success = np.concatenate([x.success for x in played])
   stages = [stage for x in played for stage in x.stages]
-  solved = int(success.sum())
+  episodes, solved = len(success), int(success.sum())
   failures = Counter(
     end_of(stages[i]) for i in np.flatnonzero(~success) if len(stages[i])
   )
   return {
-    "task": task,
-    **cell.about(),
-    **about,
-    "episodes": episodes,
+    **conditions,
     "successes": solved,
     "success_rate": solved / episodes,
     "ci95": wilson_interval(solved, episodes),

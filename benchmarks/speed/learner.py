@@ -121,7 +121,7 @@ class ForgetfulNetworks(Networks):
   def at(self, params: Params, observation: Observation) -> Heads:
     """See ``Networks.at``."""
     phi = self.apply("encoder", params, observation)
-    return ForgetfulHeads(self, params, phi, observation)
+    return ForgetfulHeads(self, params, phi, observation.primitives, observation)
 
 
 def forgetful_agent(config: AgentConfig) -> Agent:

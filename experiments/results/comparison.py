@@ -67,7 +67,7 @@ class Comparison:
   """(task, row, seed) -> command-line options that change the preset of the task."""
 
   play: str
-  """Options of both evaluations after training."""
+  """Options of the evaluations after training."""
 
   greedy: Callable[[Row], str]
   """Row -> acting rule of the second evaluation; the first one draws actions."""
@@ -75,8 +75,16 @@ class Comparison:
   second: str
   """Title of the second evaluation in the table."""
 
+  more: Sequence[str] = ()
+  """Acting rules of further evaluations."""
+
   axes: Sequence[str] = ("steps",)
   """Horizontal axes of the figure, see ``reports.figure``."""
+
+  tasks: Sequence[str] = TASKS
+  wanted: Sequence[str] = PAPER
+  seeds: Sequence[int] = (0, 1, 2)
+  """Tasks, rows and seeds that are trained if the command names no others."""
 
   def path_of(self, task: str, row: str, seed: int) -> Path:
     """Returns the file of a result."""
@@ -114,24 +122,25 @@ class Comparison:
     path = self.path_of(task, row, seed)
     run = self.sweep / path.stem
     play = [sys.executable, "-m", "apnpql_jax", "evaluate", str(run), "--json"]
-    final, greedy = (
-      json.loads(
+    rules = {"final": "policy", "greedy": self.greedy(self.rows[row])}
+    rules |= {acting: acting for acting in self.more}
+    played = {
+      kind: json.loads(
         subprocess.check_output([*play, *self.play.split(), "--acting", acting])
       )
-      for acting in ("policy", self.greedy(self.rows[row]))
-    )
+      for kind, acting in rules.items()
+    }
     result = {
       "command": ["train", task, *self.options(task, row, seed)],
       "versions": json.loads((run / "versions.json").read_text()),
       "config": json.loads((run / "config.json").read_text()),
-      "final": final,
-      "greedy": greedy,
+      **played,
       "evaluations": evaluations(run),
     }
     with replacing(path) as part:
       part.write_text(json.dumps(result, indent=1) + "\n")
-    solved = f"{final['successes']} and {greedy['successes']} of {final['episodes']}"
-    print(f"{path.stem}: {solved}", flush=True)
+    solved = tables.listed(str(x["successes"]) for x in played.values())
+    print(f"{path.stem}: {solved} of {played['final']['episodes']}", flush=True)
 
   def results(self) -> Found:
     """Returns (task, row) -> the stored results, one per seed.
@@ -140,7 +149,7 @@ class Comparison:
       SystemExit: A result was made with other settings than those of this file.
     """
     found: Found = {}
-    for task, row in itertools.product(TASKS, self.rows):
+    for task, row in itertools.product(self.tasks, self.rows):
       for path in sorted(self.out.glob(f"{task}-{row}-*.json")):
         result = json.loads(path.read_text())
         was = config_from_json(json.dumps(result["config"]))
@@ -155,7 +164,7 @@ class Comparison:
     """Plots a panel per task and axis: the mean over seeds, and their range."""
     groups = [
       Group(task, row, [as_run(result) for result in found[task, row]])
-      for task, row in itertools.product(TASKS, PAPER)
+      for task, row in itertools.product(self.tasks, self.wanted)
       if (task, row) in found
     ]
     figure.save(groups, self.out / "curves.png", axes=self.axes, band="range")
@@ -166,10 +175,12 @@ class Comparison:
     episodes = [result["final"]["episodes"] for x in found.values() for result in x]
     solved = f"solved of {tables.listed(sorted(set(episodes)))}, by seed"
     head = ["task", "row", "steps", solved, "mean (95 %)"]
-    rows = [[*head, f"{self.second}, by seed", "mean (95 %)", goal]]
+    for title in (self.second, *self.more):
+      head += [f"{title}, by seed", "mean (95 %)"]
+    rows = [[*head, goal]]
     for (task, row), results in found.items():
       shown = [task, row, f"{as_run(results[0]).config.total_steps:,}"]
-      for kind in ("final", "greedy"):
+      for kind in ("final", "greedy", *self.more):
         counts = [result[kind]["successes"] for result in results]
         runs = [as_run(result, kind) for result in results]
         shown += [tables.listed(counts), str(statistics.last(runs))]
@@ -182,9 +193,9 @@ class Comparison:
   def main(self, about: str) -> None:
     """Runs the command line of the script that ``about`` describes."""
     parser = argparse.ArgumentParser(description=about.splitlines()[0])
-    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
-    parser.add_argument("--rows", nargs="+", choices=self.rows, default=list(PAPER))
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--tasks", nargs="+", choices=self.tasks, default=self.tasks)
+    parser.add_argument("--rows", nargs="+", choices=self.rows, default=self.wanted)
+    parser.add_argument("--seeds", nargs="+", type=int, default=self.seeds)
     parser.add_argument("--jobs", type=int, default=1, help="runs at once")
     args = parser.parse_args()
     self.out.mkdir(exist_ok=True)

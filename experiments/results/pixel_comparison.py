@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from comparison import PAPER, Comparison
+from comparison import PAPER, Comparison, Row
 import state_comparison
 
 ROWS = {name: state_comparison.ROWS[name] for name in PAPER}
@@ -26,12 +26,11 @@ EVAL_EVERY = {
 """Environment steps between evaluations."""
 
 
-def options_of(task: str, row: str, seed: int) -> list[str]:
+def options(task: str, row: Row, seed: int) -> list[str]:
   """Returns the command-line options that change the preset of a task."""
-  algorithm, flags, _ = ROWS[row]
   options = (
-    f"--agent.algorithm {algorithm} --seed {seed} --no-video --eval-episodes 128 "
-    f"--eval-every {EVAL_EVERY[task]} {flags}"
+    f"--agent.algorithm {row.algorithm} --seed {seed} --no-video --eval-episodes 128 "
+    f"--eval-every {EVAL_EVERY[task]} {row.flags}"
   )
   return options.split()
 
@@ -40,7 +39,7 @@ COMPARISON = Comparison(
   out=Path(__file__).resolve().with_suffix(""),
   sweep=Path("runs/pixel_comparison"),
   rows=ROWS,
-  options=options_of,
+  options=lambda task, row, seed: options(task, ROWS[row], seed),
   play="--episodes 512 --bank-seed 1",  # Reset states that no evaluation has seen.
   greedy=lambda row: "mean",
   second="by means",

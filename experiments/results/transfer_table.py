@@ -6,16 +6,16 @@
   python experiments/results/transfer_table.py expert:stack_box
 
 A cell is physics/renderer/looks and, with Bullet, the latency in ms and "admittance".
-Every cell of every run is played by `apnpql transfer` in a process of its own, and its
-result stored as <folder>/<run>-<cell>.json. The same command again plays only what is
-missing. Then writes table.md from all files of the folder. Runs are distinguished by
-the names of their folders.
+`apnpql transfer` plays every cell of every run in a process of its own, and the result
+is stored as <folder>/<run>-<cell>.json. The same command again plays only what is
+missing. It refuses a stored result of another seed, checkpoint or setting. Then it
+writes table.md from all results of the folder. Runs are distinguished by the names of
+their folders.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 from pathlib import Path
 import subprocess
@@ -23,112 +23,240 @@ import sys
 from typing import Any
 
 from apnpql_jax.atomic import replacing
-from apnpql_jax.reports.tables import markdown
+from apnpql_jax.cli.commands import task_env
+from apnpql_jax.errors import ConfigError, FileError, UserError, one_line
+from apnpql_jax.reports.tables import listed, markdown
+from apnpql_jax.runs import checkpoint_reader, run_folder
+from apnpql_jax.transfer import conditions
+from apnpql_jax.transfer.cell import Cell
 
-OUT = Path(__file__).resolve().with_suffix("")
+OUT = Path(__file__).resolve().parent / "transfer"
 
 EXPERT = "expert:"
 
+ADMITTANCE = "admittance"
+
 CELLS = [
-  "/".join(cell)
-  for cell in itertools.product(
-    ("native", "bullet"), ("rays", "opengl", "tiny"), ("trained", "plain", "unseen")
-  )
-  if cell[1:] != ("rays", "unseen")
+  "native/rays/plain",
+  "native/rays/trained",
+  "native/opengl/trained",
+  "native/opengl/unseen",
+  "bullet/rays/plain",
+  *(f"bullet/tiny/unseen/{latency}" for latency in (0, 30, 60)),
+  *(f"bullet/tiny/unseen/{latency}/{ADMITTANCE}" for latency in (0, 30, 60)),
 ]
-"""All cells, without MJX, which integrates the same equations as C MuJoCo."""
+"""Cells of a policy, from the world of the scene file on; others can be named."""
 
 EXPERT_CELLS = ["native/rays/plain", "bullet/rays/plain"]
 """Cells of the expert, which sees no images."""
 
-HEAD = "run task trained physics renderer looks latency admittance solved 95%"
+HEAD = "run,task,trained,physics,renderer,looks,latency,admittance,solved,95%,failed in"
 """Columns of the table; trained: in plain or randomized worlds."""
 
-
-def options_of(run: str, cell: str) -> list[str]:
-  """Returns the arguments of `apnpql transfer`."""
-  physics, renderer, looks, *more = cell.split("/")
-  who = [run]
-  if run.startswith(EXPERT):
-    who = ["expert", "--task", run.removeprefix(EXPERT)]
-  options = ["--physics", physics, "--renderer", renderer, "--looks", looks]
-  for word in more:
-    options += ["--admittance"] if word == "admittance" else ["--latency-ms", word]
-  return [*who, *options]
+MALFORMED = (OSError, ValueError, LookupError, TypeError, AttributeError)
+"""Exceptions that a damaged result causes."""
 
 
-def path_of(out: Path, run: str, cell: str) -> Path:
-  """Returns the file of a result."""
-  name = run.replace(":", "-") if run.startswith(EXPERT) else Path(run).name
-  return out / f"{name}-{cell.replace('/', '-')}.json"
-
-
-def play(path: Path, run: str, cell: str, episodes: int, seed: int) -> None:
-  """Plays a cell and stores its result.
+def cell_of(text: str) -> Cell:
+  """Returns the cell that a text such as bullet/tiny/unseen/60/admittance describes.
 
   Raises:
-    SystemExit: The command failed; it has told why.
+    ConfigError: There is no such cell, or a package is missing.
   """
-  count = ["--episodes", str(episodes), "--seed", str(seed), "--json"]
+  names, more = text.split("/")[:3], text.split("/")[3:]
+  admittance = more[-1:] == [ADMITTANCE]
+  latency = more[:-1] if admittance else more
+  if len(names) < 3 or len(latency) > 1 or not all(x.isdecimal() for x in latency):
+    shape = f"physics/renderer/looks[/latency in ms][/{ADMITTANCE}]"
+    raise ConfigError(f"cell {text!r} must have the form {shape}")
+  latency_ms = int(latency[0]) if latency else None
+  cell = Cell(*names, latency_ms=latency_ms, admittance=admittance)
+  cell.check()
+  return cell
+
+
+def name_of(cell: Cell) -> str:
+  """Returns the part of a file's name that stands for a cell."""
+  about = cell.about()
+  parts = [cell.physics, cell.renderer, cell.looks]
+  if "latency_ms" in about:
+    parts += [str(about["latency_ms"]), *[ADMITTANCE] * cell.admittance]
+  return "-".join(parts)
+
+
+def label_of(run: str) -> str:
+  """Returns what the table calls a run."""
+  return "expert" if run.startswith(EXPERT) else Path(run).absolute().name
+
+
+def path_of(out: Path, run: str, cell: Cell) -> Path:
+  """Returns the file of a result."""
+  name = run.replace(":", "-") if run.startswith(EXPERT) else label_of(run)
+  return out / f"{name}-{name_of(cell)}.json"
+
+
+def options_of(run: str, cell: Cell) -> list[str]:
+  """Returns the arguments of `apnpql transfer`."""
+  options = [run]
+  if run.startswith(EXPERT):
+    options = ["expert", "--task", run.removeprefix(EXPERT)]
+  about = cell.about()
+  for name in ("physics", "renderer", "looks", "latency_ms"):
+    if name in about:
+      options += [f"--{name.replace('_', '-')}", str(about[name])]
+  return [*options, *["--admittance"] * cell.admittance]
+
+
+def conditions_of(run: str, cell: Cell, episodes: int, seed: int) -> dict[str, Any]:
+  """Returns what the result of a cell must hold.
+
+  Raises:
+    UserError: There is no such task or run, or it has no checkpoint.
+  """
+  if run.startswith(EXPERT):
+    config = task_env(run.removeprefix(EXPERT))
+    return conditions.of_expert(config, cell, episodes=episodes, seed=seed)
+  folder = run_folder.open_run(Path(run))
+  step = checkpoint_reader.restore(folder.path, None, {}, config=folder.config).step
+  return conditions.of_run(
+    folder.path, folder.config, step, cell, acting=None, episodes=episodes, seed=seed
+  )
+
+
+def check(path: Path, wanted: dict[str, Any]) -> None:
+  """Checks that a stored result was played under the wanted conditions.
+
+  Raises:
+    FileError: It was not, or it is damaged.
+  """
+  found = read(path)
+  differing = [
+    f"{name} {found.get(name, 'unknown')} instead of {value}"
+    for name, value in wanted.items()
+    if found.get(name) != value
+  ]
+  if differing:
+    cure = "remove it to play it again, or choose another --out"
+    raise FileError(f"{path} has {', '.join(differing)}; {cure}")
+
+
+def read(path: Path) -> dict[str, Any]:
+  """Returns a stored result.
+
+  Raises:
+    FileError: It is damaged.
+  """
+  try:
+    found = json.loads(path.read_text())
+    order(found), row_of(found)
+    return found
+  except MALFORMED as error:
+    raise FileError(
+      f"{path} is not a result of this script: {one_line(error)}; remove it"
+    ) from None
+
+
+def play(
+  path: Path, run: str, cell: Cell, wanted: dict[str, Any], *, video: bool
+) -> None:
+  """Plays a cell and stores its result.
+
+  Args:
+    path: The file of the result.
+    run: A run folder, or expert:TASK.
+    cell: The cell.
+    wanted: The conditions.
+    video: Whether to film the first success and the first failure, next to ``path``.
+
+  Raises:
+    SystemExit: The command failed; it has printed why.
+  """
   command = [sys.executable, "-m", "apnpql_jax", "transfer", *options_of(run, cell)]
-  done = subprocess.run([*command, *count], stdout=subprocess.PIPE, check=False)
+  command += ["--episodes", str(wanted["episodes"]), "--seed", str(wanted["seed"])]
+  path.parent.mkdir(parents=True, exist_ok=True)
+  if video:
+    command += ["--video", str(path.with_suffix(".mp4")), "--overwrite"]
+  done = subprocess.run([*command, "--json"], stdout=subprocess.PIPE, check=False)
   if done.returncode:
     sys.exit(done.returncode)
   found = json.loads(done.stdout)
-  path.parent.mkdir(parents=True, exist_ok=True)
+  if found.get("video"):
+    found["video"] = Path(found["video"]).name  # The folder is that of this machine.
   with replacing(path) as part:
-    part.write_text(json.dumps({"run": path_name(run), **found}, indent=1) + "\n")
+    part.write_text(json.dumps({"run": label_of(run), **found}, indent=1) + "\n")
   print(f"{path.stem}: {found['successes']} of {found['episodes']}", flush=True)
-
-
-def path_name(run: str) -> str:
-  """Returns the name of a run in the table."""
-  return "expert" if run.startswith(EXPERT) else Path(run).name
 
 
 def table(results: list[dict[str, Any]]) -> str:
   """Returns the results in Markdown, a row per cell."""
-  rows = [list[str](HEAD.split())]
-  for found in sorted(results, key=order):
-    low, high = (100 * x for x in found["ci95"])
-    trained = found.get("trained", "-")
-    latency = f"{found['latency_ms']} ms" if "latency_ms" in found else "-"
-    yields = {True: "on", False: "off"}.get(found.get("admittance"), "-")
-    solved = f"{found['successes']} of {found['episodes']}"
-    rows.append(
-      [found["run"], found["task"], trained]
-      + [found["physics"], found["renderer"], found["looks"], latency, yields]
-      + [solved, f"{low:.1f} to {high:.1f} %"]
-    )
+  rows = [list[str](HEAD.split(","))]
+  rows += [row_of(found) for found in sorted(results, key=order)]
   return markdown(rows) + "\n"
 
 
-def order(found: dict[str, Any]) -> tuple[str, ...]:
+def row_of(found: dict[str, Any]) -> list[str]:
+  """Returns the row of a result."""
+  low, high = (100 * x for x in found["ci95"])
+  latency = f"{found['latency_ms']} ms" if "latency_ms" in found else "-"
+  admittance = {True: "on", False: "off"}.get(found.get("admittance"), "-")
+  failures = sorted(found["failures"].items(), key=lambda item: -item[1])
+  return [
+    *(found[name] for name in ("run", "task")),
+    found.get("trained", "-"),
+    *(found[name] for name in ("physics", "renderer", "looks")),
+    latency,
+    admittance,
+    f"{found['successes']} of {found['episodes']}",
+    f"{low:.1f} to {high:.1f} %",
+    listed(f"{stage}: {count}" for stage, count in failures) or "-",
+  ]
+
+
+def order(found: dict[str, Any]) -> tuple[Any, ...]:
   """Returns what rows are sorted by."""
-  names = "task run physics renderer looks latency_ms admittance".split()
-  return tuple(str(found.get(name, "")) for name in names)
+  names = [str(found[x]) for x in ("task", "run")]
+  cell = [("mjx", "native", "bullet").index(found["physics"])]
+  cell += [("rays", "opengl", "tiny").index(found["renderer"])]
+  cell += [("plain", "trained", "unseen").index(found["looks"])]
+  return (*names, *cell, found.get("admittance", False), found.get("latency_ms", 0))
 
 
 def main() -> None:
   parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
   parser.add_argument("runs", nargs="*", help="run folders, or expert:TASK")
-  parser.add_argument("--cells", nargs="+", help="default: all that there are")
+  parser.add_argument("--cells", nargs="+", help="default: those of the table")
   parser.add_argument("--episodes", type=int, default=200)
   parser.add_argument("--seed", type=int, default=0)
   parser.add_argument("--out", type=Path, default=OUT, help="folder of the results")
+  parser.add_argument("--video", action="store_true", help="also film each cell")
   args = parser.parse_args()
-  for run in args.runs:
-    default = EXPERT_CELLS if run.startswith(EXPERT) else CELLS
-    for cell in args.cells or default:
-      path = path_of(args.out, run, cell)
+  try:
+    cells = {
+      path_of(args.out, run, cell): (run, cell)
+      for run in args.runs
+      for cell in map(cell_of, args.cells or cells_of(run))
+    }
+    # First: a cell takes minutes.
+    wanted = {
+      path: conditions_of(*chosen, args.episodes, args.seed)
+      for path, chosen in cells.items()
+    }
+    for path in filter(Path.exists, wanted):
+      check(path, wanted[path])
+    for path in wanted:
       if not path.exists():
-        play(path, run, cell, args.episodes, args.seed)
-      elif (was := json.loads(path.read_text())["episodes"]) != args.episodes:
-        sys.exit(f"{path} has {was} episodes; remove it to play {args.episodes}")
-  found = [json.loads(path.read_text()) for path in sorted(args.out.glob("*.json"))]
+        play(path, *cells[path], wanted[path], video=args.video)
+    found = [read(path) for path in sorted(args.out.glob("*.json"))]
+  except UserError as error:
+    sys.exit(str(error))
   if found:
     (args.out / "table.md").write_text(table(found))
     print(table(found))
+
+
+def cells_of(run: str) -> list[str]:
+  """Returns the cells of a run that names none."""
+  return EXPERT_CELLS if run.startswith(EXPERT) else CELLS
 
 
 if __name__ == "__main__":

@@ -32,6 +32,7 @@ EVERYTHING = {
 GONE = {
   "--agent.regularizer uniform": {"loss/m", "loss/nu", "bp", "nu"},
   "--agent.prior-mean learned": set(),
+  "--agent.no-primitive-gripper": set(),
   "--agent.learning-rate-m 0": {"bp"},
   "--agent.learning-rate-nu 0": {"nu"},
   "--replay.expert-share 0 --replay.expert-steps 0": set(),

@@ -287,7 +287,7 @@ def test_value_head_is_a_plain_network_of_features_and_action():
   x = np.maximum(both @ kernel + z["phi"]["bias"], 0.0)
   x = np.maximum(x @ z["Dense_0"]["kernel"] + z["Dense_0"]["bias"], 0.0)
   expected = x @ z["out"]["kernel"] + z["out"]["bias"]
-  ours = Heads(networks, params, phi).z(actions)
+  ours = Heads(networks, params, phi, None).z(actions)
   np.testing.assert_allclose(ours, expected, rtol=1e-4, atol=1e-5)
 
 
@@ -436,6 +436,37 @@ def test_the_setting_decides_whether_the_prior_learns_its_gripper(settings, lear
 
   slope = jax.grad(first)(params["bp"])["out"]["bias"]
   assert bool(np.any(slope)) == learned
+
+
+def test_without_grippers_of_primitives_only_the_m_step_closes_the_hand():
+  networks = all_networks(
+    dataclasses.replace(CONFIG, primitive_gripper=False, gripper_offset=True)
+  )
+  seen = observation(4, pixels=False)
+  params = jax.jit(networks.init)(jax.random.key(0), seen)
+  params["ap"]["out"]["bias"] = jnp.linspace(-4.0, 4.0, 21)
+  close = np.asarray(networks.at(params, seen).prior().gripper_logits)
+  assert np.abs(close).max() < 0.1  # A fresh head of the M-step.
+  outputs = params["bp"]["out"]["bias"].reshape(3, -1).at[:, -1].add(2.0)
+  params["bp"]["out"]["bias"] = outputs.ravel()
+  closing = networks.at(params, seen).prior().gripper_logits
+  np.testing.assert_allclose(closing, close + 2.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("instants", [0, 3])
+def test_true_primitives_replace_the_predicted_ones(instants: int):
+  networks = all_networks(dataclasses.replace(CONFIG, lstm_instants=instants))
+  rng, batch = np.random.default_rng(5), (4, instants) if instants else (4,)
+  true = jnp.asarray(rng.uniform(-1.0, 1.0, (*batch, 3, 7)), jnp.float32)
+  true = true.at[..., 6].set(rng.integers(0, 2, (*batch, 3)))
+  seen = Observation(
+    robot=jnp.zeros((*batch, 21)), tool=jnp.zeros((*batch, 3)), primitives=true
+  )
+  heads = networks.at(jax.jit(networks.init)(jax.random.key(0), seen), seen)
+  newest = true[:, -1] if instants else true
+  np.testing.assert_array_equal(heads.prior().loc, newest[..., :6])
+  closes = jax.nn.sigmoid(heads.primitives()[..., 6])
+  np.testing.assert_allclose(closes, newest[..., 6], atol=1e-3)
 
 
 def test_a_limit_lets_the_gradient_back_in():

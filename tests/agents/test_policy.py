@@ -45,7 +45,7 @@ def heads() -> KnownValues:
   params = jax.jit(networks.init)(jax.random.key(0), seen)
   params["policy"]["out"]["bias"] = 0.2 * jnp.sin(jnp.arange(29.0))
   bound = networks.at(params, seen)
-  return KnownValues(bound.networks, bound.params, bound.phi)
+  return KnownValues(bound.networks, bound.params, bound.phi, None)
 
 
 @pytest.mark.parametrize("name", ["prior", "policy"])

@@ -119,6 +119,7 @@ BAD_INPUT = [
   ("transfer runs/old --physics moon", ["'moon'", "mjx, native"]),
   ("transfer runs/old --renderer paint", ["'paint'", "rays, opengl"]),
   ("transfer runs/old --looks unseen", ["unseen", "--renderer opengl"]),
+  ("transfer runs/old --no-admittance", ["--no-admittance", "transfer --help"]),
   ("transfer runs/old", ["no checkpoint"]),
   ("evaluate runs/broken", ["config.json", "'env'", "missing"]),
   ("collect", ["push_plate"]),

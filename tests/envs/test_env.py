@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +14,10 @@ from scipy import stats
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config.schema import AgentConfig, EnvConfig
 from apnpql_jax.data import replay
-from apnpql_jax.envs.env import Env, make_env
+from apnpql_jax.envs.env import Env, make_env, observation_shapes
+from apnpql_jax.envs.state import Arrival, EnvState
 from apnpql_jax.errors import ConfigError
+from apnpql_jax.primitives import tracking
 from apnpql_jax.sim import arm
 from apnpql_jax.training import evaluate
 from apnpql_jax.training.evaluate import play_held_out
@@ -94,6 +97,43 @@ def test_the_action_of_the_expert_is_a_label_where_it_is_imitated(env):
   state = imitated.reset(jnp.arange(4))
   np.testing.assert_array_equal(state.timestep.expert, env.expert_action(state))
   assert env.reset(jnp.arange(4)).timestep.expert is None
+
+
+def test_static_targets_do_not_follow_a_plate_that_moves(env):
+  """The labels lead to where the plate was; the expert still acts on where it is."""
+  static = Env(
+    dataclasses.replace(CONFIG, static_targets=True), env.task, env._bank, imitated=True
+  )
+  rows, joints = jnp.arange(8), env.task.scene.arm_qpos
+  at, _ = env.task.scene.free_joint("plate")
+  follows, stays = (worlds.reset(rows) for worlds in (env, static))
+
+  def moved(worlds: Env, state: EnvState) -> EnvState:
+    qpos = state.physics.qpos.at[:, at].add(0.05)
+    physics = state.physics.replace(qpos=qpos)
+    same = jnp.zeros(8, bool)
+    return worlds.observe(Arrival.after(state, physics, state.targets, same))
+
+  follows, stays = moved(env, follows), moved(static, stays)
+  q = stays.physics.qpos[:, None, joints]
+  expected = tracking.follow(env._bank.targets[rows], q)
+  labels = stays.timestep.primitives
+  np.testing.assert_allclose(labels[..., :6], expected, atol=1e-5)
+  np.testing.assert_array_equal(labels[..., 6], follows.timestep.primitives[..., 6])
+  assert np.abs(labels - follows.timestep.primitives).max() > 0.02
+  expert = env.expert_action(follows)
+  np.testing.assert_allclose(static.expert_action(stays), expert, atol=1e-3)
+  assert stays.timestep.expert is not None
+  np.testing.assert_allclose(stays.timestep.expert, expert, atol=1e-3)
+
+
+def test_true_primitives_are_observed_if_wanted(env):
+  config = dataclasses.replace(CONFIG, true_primitives=True)
+  timestep = Env(config, env.task, env._bank).reset(jnp.arange(4)).timestep
+  np.testing.assert_array_equal(timestep.observation.primitives, timestep.primitives)
+  assert env.reset(jnp.arange(4)).observation.primitives is None
+  shapes: Any = observation_shapes(config, env.task, instants=0)
+  assert shapes.primitives.shape == (1, 3, 7)
 
 
 def test_time_out_truncates_then_resets(env):

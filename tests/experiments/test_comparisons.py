@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import json
 
+import ablations
 from comparison import PAPER, TASKS, Comparison
 import pixel_comparison
 import pytest
@@ -18,8 +19,8 @@ from apnpql_jax.config.files import config_diff
 COMPARISONS = [state_comparison.COMPARISON, pixel_comparison.COMPARISON]
 RUNS = [
   (comparison, task, row)
-  for comparison in COMPARISONS
-  for task, row in itertools.product(TASKS, comparison.rows)
+  for comparison in (*COMPARISONS, ablations.COMPARISON)
+  for task, row in itertools.product(comparison.tasks, comparison.rows)
 ]
 
 by_folder = pytest.mark.parametrize("comparison", COMPARISONS, ids=lambda x: x.out.name)
@@ -42,6 +43,24 @@ def test_rows_of_the_paper_differ_in_the_algorithm_and_its_own_settings(
   own = {"algorithm", "epsilon", "policy_initial_std", "min_alpha"}
   for other in others:
     assert config_diff(first, other).keys() <= {f"agent.{name}" for name in own}
+
+
+@pytest.mark.parametrize("task", ablations.COMPARISON.tasks)
+def test_each_ablation_changes_one_part(task: str):
+  full, *others = (
+    ablations.COMPARISON.config_of(task, row, 0) for row in ablations.ROWS
+  )
+  changed = [config_diff(full, other).keys() for other in others]
+  temperature = {"agent.temperature", "agent.initial_alpha"}
+  assert changed == [
+    {"agent.algorithm"},
+    {"agent.learning_rate_m"},
+    {"agent.learning_rate_m", *temperature},
+    {"replay.expert_share"},
+    {"env.static_targets"},
+    {"agent.primitive_gripper"},
+    {"env.true_primitives"},
+  ]
 
 
 @by_folder

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from apnpql_jax.robot.arm_model import ArmModel
-from apnpql_jax.robot.core import Command, Core
+from apnpql_jax.robot.core import HOME_SPEED, Command, Core
 from apnpql_jax.robot.limits import BRAKING, TIMESTEP, Limits
 from apnpql_jax.robot.protocols import ArmState
-from apnpql_jax.robot.supervisor import Action, Mode
+from apnpql_jax.robot.supervisor import JAM_S, Action, Mode
 from apnpql_jax.robot.virtual_arm import LEAD, Admittance, VirtualArm
 
 NEUTRAL = np.array([-1.8957, -1.7712, 1.9888, -1.7884, -1.5708, -0.3249])
@@ -31,10 +31,11 @@ class World:
   """A lagging arm, the core, and a policy that acts every period; time in cycles."""
 
   lag: float = 0.03
+  admittance: Admittance | None = Admittance()
   cycle: int = 0
 
   def __post_init__(self):
-    self.core = Core(LIMITS, model=MODEL, admittance=Admittance())
+    self.core = Core(LIMITS, model=MODEL, admittance=self.admittance)
     self.arm, self.speed, self.wrench = NEUTRAL.copy(), np.zeros(6), np.zeros(6)
     self.action: Action | None = None
     self.measured_at: float | None = None
@@ -54,7 +55,12 @@ class World:
     self.action = Action(number, self.now, np.asarray(values, float), frames)
 
   def step(self, fault: str = "") -> Command:
-    command = self.core.step(self.now, self.state(fault), self.action)
+    return self.follow(self.core.step(self.now, self.state(fault), self.action))
+
+  def move(self, target: np.ndarray) -> Command:
+    return self.follow(self.core.move(self.now, self.state(), target))
+
+  def follow(self, command: Command) -> Command:
     before = self.arm
     self.arm = before + (TIMESTEP / self.lag) * (command.position - before)
     self.speed = (self.arm - before) / TIMESTEP
@@ -73,9 +79,9 @@ class World:
 FAST = np.array([1.0, 0.3, -0.3, 0.2, 0.2, 1.0, 0.0])
 
 
-def moving() -> World:
+def moving(admittance: Admittance | None = Admittance()) -> World:  # noqa: B008
   """Returns a world whose arm moves at nearly 1 rad/s, just after an action."""
-  world = World()
+  world = World(admittance=admittance)
   world.core.start(world.now, world.state())
   world.play(lambda _: FAST, 6 * PERIOD)
   world.act(FAST)
@@ -123,6 +129,7 @@ def killed_policy(world: World) -> None:
   world.core.supervisor.stop("policy: its process has ended")
 
 
+PUSH = push(31)
 FAULTS = {
   "policy: the action is not finite": (nan_action, Mode.HOLD),
   "camera wrist: frame is 101 ms old": (stale_frame, Mode.HOLD),
@@ -130,7 +137,7 @@ FAULTS = {
   "joints: measurement is 21 ms old": (stale_joints, Mode.STOP),
   "arm: a measurement is not finite": (nan_joints, Mode.STOP),
   "arm: a measurement is not finite ": (nan_wrench, Mode.STOP),
-  "force: above 30 N on the tool": (push(31), Mode.HOLD),
+  "force: above 30 N on the tool": (PUSH, Mode.HOLD),
   "force: 51 N on the tool": (push(-51), Mode.STOP),
   "policy: a period late": (silent_policy, Mode.HOLD),
   "policy: its process has ended": (killed_policy, Mode.STOP),
@@ -140,7 +147,8 @@ FAULTS = {
 @pytest.mark.parametrize("reason", FAULTS)
 def test_at_rest_within_half_a_second_of_a_fault_with_its_reason(reason):
   cause, mode = FAULTS[reason]
-  world = moving()
+  # A hold because of a force gives way to it with admittance, see below.
+  world = moving(None if cause is PUSH else Admittance())
   cause(world)
   first = world.step()
   assert first.mode == mode and first.reason == reason.strip()
@@ -239,6 +247,59 @@ def test_a_jam_stops_and_a_hit_only_holds():
   assert (last.mode, last.reason) == (Mode.STOP, "force: 35 N on the tool for 1 s")
 
 
+def pressed_on_a_wall(world: World, stiffness: float, speed: float, seconds: float):
+  """Moves down onto a wall; returns the force (N) and the command of each cycle."""
+  dynamics = MODEL.dynamics(NEUTRAL, np.zeros(6))
+  down = np.linalg.solve(dynamics.tool, [0, 0, -speed, 0, 0, 0])
+  wall, found = MODEL.tool_position(NEUTRAL)[2] - 0.02, []
+  for cycle in range(round(seconds / TIMESTEP)):
+    if cycle % PERIOD == 0:
+      world.act(np.append(down, 0.0))
+    depth = wall - MODEL.tool_position(world.arm)[2]
+    world.wrench = np.array([0, 0, max(0.0, stiffness * depth), 0, 0, 0.0])
+    found.append((world.wrench[2], world.step()))
+  return found
+
+
+def test_a_hold_because_of_a_force_gives_way_to_it():
+  """The force falls below the limit, and the policy has the arm again."""
+  found = pressed_on_a_wall(World(), 1e4, 0.1, 2.0)
+  modes = [command.mode for _, command in found]
+  first = modes.index(Mode.HOLD)
+  follows = modes.index(Mode.FOLLOW, first)
+  assert (follows - first) * TIMESTEP < 0.4 and Mode.STOP not in modes
+  assert min(force for force, _ in found[first:follows]) < 0.5 * LIMITS.hold_force
+  assert max(force for force, _ in found[follows:]) < LIMITS.hold_force
+
+
+def test_without_admittance_a_hold_because_of_a_force_stays_pressed_and_stops():
+  found = pressed_on_a_wall(World(admittance=None), 5e3, 0.05, 3.0)
+  modes = [command.mode for _, command in found]
+  first, stop = modes.index(Mode.HOLD), modes.index(Mode.STOP)
+  assert set(modes[first:stop]) == {Mode.HOLD}
+  assert (stop - first) * TIMESTEP == pytest.approx(JAM_S, abs=0.01)
+  assert min(force for force, _ in found[first:]) > LIMITS.hold_force
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("force", [31.0, -45.0])
+def test_giving_way_is_slow(axis, force):
+  """The tool moves by the felt force over the damping per second, and then stops."""
+  world = moving()
+  world.wrench = force * np.eye(6)[axis]
+  most = abs(force) / Admittance().damping
+  for cycle in range(1, round((JAM_S + 0.3) / TIMESTEP)):
+    command = world.step()
+    if cycle % PERIOD == 0:
+      world.act(FAST)
+    limiter, time = world.core.limiter, cycle * TIMESTEP
+    jacobian = MODEL.dynamics(limiter.position, np.zeros(6)).tool[:3]
+    if time > 0.3:  # It brakes first.
+      assert np.linalg.norm(jacobian @ limiter.velocity) < most
+      assert command.mode is (Mode.HOLD if time < JAM_S - 0.01 else command.mode)
+  assert command.mode is Mode.STOP and command.at_rest
+
+
 def test_no_first_action_holds_then_stops():
   world = World()
   world.core.start(world.now, world.state())
@@ -278,6 +339,43 @@ def test_commands_keep_the_limits_for_every_policy_and_contact(seed, lag, noise)
     tool = MODEL.tool_position(command.position)
     assert (tool >= LIMITS.box[:, 0]).all() and (tool <= LIMITS.box[:, 1]).all()
     before = command.position
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_way_home_is_a_straight_line_of_joints(seed):
+  """Also through a hold, which ends where the arm has come to rest."""
+  rng = np.random.default_rng(seed)
+  world = World()
+  world.arm = start = NEUTRAL + np.append(rng.uniform(-0.2, 0.2, 5), 0.4)
+  world.core.start(world.now, world.state(), NEUTRAL)
+  along, speeds, modes = (NEUTRAL - start) / np.linalg.norm(NEUTRAL - start), [], []
+  while not world.core.has_arrived(NEUTRAL):
+    push(35.0 if 400 <= world.cycle < 500 else 0.0)(world)
+    command = world.move(NEUTRAL)
+    modes.append(command.mode)
+    speeds.append(world.core.limiter.velocity)
+    away = command.position - start
+    assert np.abs(away - (away @ along) * along).max() < 1e-9
+    assert world.cycle < 3000
+  assert Mode.HOLD in modes and Mode.STOP not in modes
+  assert np.abs(speeds).max() == pytest.approx(HOME_SPEED, rel=0.1)
+  changes = np.abs(np.diff(speeds, axis=0)).max(axis=1) / TIMESTEP
+  assert (changes <= LIMITS.braking + 1e-6).all()
+  follows = [x is y is Mode.FOLLOW for x, y in zip(modes, modes[1:], strict=False)]
+  # At last it brakes from 0.01 rad/s.
+  assert changes[:-3][follows[:-3]].max() <= LIMITS.acceleration + 1e-6
+
+
+def test_no_way_home_begins_that_leaves_the_box():
+  """The arm would stop halfway."""
+  world = World()
+  over = NEUTRAL.copy()
+  over[0] += 2.5  # The arc of the shoulder leads past the side of the table.
+  world.core.start(world.now, world.state(), over)
+  command = world.move(over)
+  assert command.mode is Mode.STOP and command.at_rest
+  assert "outside the workspace box" in command.reason
+  np.testing.assert_array_equal(command.position, NEUTRAL)
 
 
 def test_free_motion_through_the_limits_is_that_of_the_virtual_arm():

@@ -207,6 +207,19 @@ def _alive(pid: int) -> bool:
   return state != "Z" and os.path.exists(f"/proc/{pid}")
 
 
+def test_a_simulated_arm_can_be_put_back_where_it_began():
+  robot = Robot("simulated", CONTRACT, Cell(), CLOCK)
+  with simulated.started(robot) as robot, simulated.opened(robot) as plant:
+    begin = plant["plant"].read()["position"]
+    np.testing.assert_allclose(begin, NEUTRAL + simulated.PARKED, atol=1e-3)
+    plant["servo"].write({"follow": 1, "target": NEUTRAL})
+    until(lambda: np.abs(plant["plant"].read()["position"] - NEUTRAL).max() < 0.02)
+    plant["servo"].write({"follow": 0})
+    plant["scene"].write({"parked": 1})
+    until(lambda: plant["plant"].read()["parked"] == 1)
+    np.testing.assert_allclose(plant["plant"].read()["position"], begin, atol=1e-3)
+
+
 def test_a_reader_never_sees_half_a_record():
   """A writer in another process, as fast as it can."""
   with Board(records=FLOOD) as board:

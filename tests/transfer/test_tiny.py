@@ -15,7 +15,6 @@ from apnpql_jax import testing
 from apnpql_jax.envs.cameras import make_cameras
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.randomization.randomize import make_randomize
-from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.transfer import tiny
 from apnpql_jax.transfer.tiny import Tiny
@@ -58,9 +57,9 @@ def test_tiny_sees_what_the_ray_caster_sees(randomize, plain, env, state):
     # TinyRenderer draws no checkers and no waves.
     ranges = dataclasses.replace(CONFIG.randomization, texture=0.0, color=0.4)
     keys = jax.random.split(jax.random.key(1), len(ROWS))
-    state = make_randomize(ranges, scene)(state, keys)
+    state = jax.jit(make_randomize(ranges, scene))(state, keys)
   found = images(plain, env, state)
-  kinematics = make_kinematics(scene)(state)
+  kinematics = env.poses(state)
   for camera, image in zip(make_cameras(CONFIG, scene), found, strict=True):
     expected = np.asarray(jax.jit(camera)(kinematics)).astype(int)
     difference = np.abs(image.astype(int) - expected).max(-1)

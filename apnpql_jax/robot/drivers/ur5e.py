@@ -151,7 +151,7 @@ class UR5e:
     if moves:
       self._open().wait_for_rest()
 
-  def start(self) -> None:
+  def start(self, *, zero: bool = True) -> None:
     """See ``protocols.Arm``; sets the payload first.
 
     Raises:
@@ -165,7 +165,8 @@ class UR5e:
       self._restart()
     reports.wait_for_rest()
     self._command("payload", control.setPayload, *self._payload)
-    self._command("zero of the force sensor", control.zeroFtSensor)
+    if zero:
+      self._command("zero of the force sensor", control.zeroFtSensor)
     reports.wait_for_news()  # Older measurements have the old zero.
     self._following = True
 

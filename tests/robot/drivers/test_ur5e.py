@@ -101,6 +101,15 @@ def test_start_takes_bias_and_payload_off_the_wrench():
   assert np.linalg.norm(before[:3]) > 2 and np.linalg.norm(after) < 1e-3
 
 
+def test_start_keeps_the_zero_if_asked_to():
+  with doubles.start("push_plate", noise=False) as devices:
+    devices.arm.start(zero=False)
+    assert np.linalg.norm(devices.arm.get_observation().wrench[:3]) > 2
+    devices.arm.stop()
+    devices.arm.start()
+    assert np.linalg.norm(devices.arm.get_observation().wrench) < 1e-3
+
+
 def test_the_table_pushes_the_tool_up(rig):
   position, force = rig.arm.get_observation().position, 0.0
   for _ in range(6000):

@@ -1,0 +1,54 @@
+"""The force-torque sensor of the tool flange: its error, and a simulated one.
+
+The data sheet of the UR5e gives an accuracy of 4 N and 0.3 N m. Assumed here: each axis
+of a zeroed sensor is off by at most that, which covers drift since the zero and the
+errors of payload and posture. So the error of a free hand's reading has a norm of up
+to sqrt(3) 4 N = 6.9 N and sqrt(3) 0.3 N m = 0.52 N m, as all axes may be off at once.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+FORCE_ACCURACY, TORQUE_ACCURACY = 4.0, 0.3
+"""Largest error of an axis, N and N m (data sheet of the UR5e)."""
+
+FREE_FORCE, FREE_TORQUE = 7.5, 0.6
+"""What a free hand reads at most, as a norm, in N and N m.
+
+The error of the module's docstring, and 0.6 N and 0.08 N m for noise: three standard
+deviations of the noise of ``Sensor`` after the filter of the virtual arm.
+"""
+
+NOISE = np.repeat([0.5, 0.05], 3)
+"""Standard deviation of each reading of a simulated sensor, N and N m; a guess."""
+
+POWER_ON = 3.0
+"""Offset of a simulated sensor that has not been zeroed, in accuracies; a guess."""
+
+
+def load(wrench: np.ndarray) -> float:
+  """Returns a wrench f64[6] in terms of what a free hand reads: above 1 it touches."""
+  force, torque = np.linalg.norm(wrench.reshape(2, 3), axis=1)
+  return float(max(force / FREE_FORCE, torque / FREE_TORQUE))
+
+
+class Sensor:
+  """A simulated sensor with an offset and noise; wrenches are f64[6], N and N m."""
+
+  def __init__(self, rng: np.random.Generator) -> None:
+    """Draws the offset that the sensor has before its first zero."""
+    self._rng = rng
+    self._offset = POWER_ON * self._error()
+
+  def zero(self, wrench: np.ndarray) -> None:
+    """Takes the present ``wrench`` for none, up to an error that it draws."""
+    self._offset = self._error() - wrench
+
+  def read(self, wrench: np.ndarray) -> np.ndarray:
+    """Returns a reading of the true ``wrench``."""
+    return wrench + self._offset + NOISE * self._rng.normal(size=6)
+
+  def _error(self) -> np.ndarray:
+    """Returns an error of which all sizes within the accuracy are as likely."""
+    return np.repeat([FORCE_ACCURACY, TORQUE_ACCURACY], 3) * self._rng.uniform(-1, 1, 6)

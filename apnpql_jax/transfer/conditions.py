@@ -1,0 +1,80 @@
+"""Conditions of a result: what decides on the episodes of a cell.
+
+Two results with equal conditions come from the same worlds and the same policy.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+import zlib
+
+from apnpql_jax.config.schema import EnvConfig, TrainConfig
+from apnpql_jax.runs import checkpoint_record
+from apnpql_jax.transfer.cell import Cell
+
+
+def of_expert(
+  config: EnvConfig, cell: Cell, *, episodes: int, seed: int
+) -> dict[str, Any]:
+  """Returns the conditions of episodes of the scripted expert."""
+  return {
+    "task": config.task,
+    "env_crc32": _env_crc32(config),
+    **cell.about(),
+    "algorithm": "expert",
+    "episodes": episodes,
+    "seed": seed,
+  }
+
+
+def of_run(
+  run_dir: Path,
+  config: TrainConfig,
+  step: int,
+  cell: Cell,
+  *,
+  acting: str | None,
+  episodes: int,
+  seed: int,
+) -> dict[str, Any]:
+  """Returns the conditions of episodes of a run's policy.
+
+  Args:
+    run_dir: The run folder.
+    config: Its settings.
+    step: The step of the checkpoint.
+    cell: The worlds.
+    acting: Rule that chooses actions; that of the run's evaluations if None.
+    episodes: Number of episodes.
+    seed: Random seed of the episodes and of the policy.
+
+  Raises:
+    FileError: The record of the checkpoint cannot be read.
+  """
+  learner = checkpoint_record.read(run_dir, step).items.get("learner", {})
+  return {
+    "task": config.env.task,
+    "env_crc32": _env_crc32(config.env),
+    **cell.about(),
+    "algorithm": config.agent.algorithm,
+    "trained": "randomized" if config.env.randomize else "plain",
+    "checkpoint_step": step,
+    "weights_crc32": _crc32(learner),
+    "acting": acting or config.eval_acting,
+    "episodes": episodes,
+    "seed": seed,
+  }
+
+
+def _env_crc32(config: EnvConfig) -> int:
+  """Returns a checksum of the settings that worlds and images depend on."""
+  # A cell chooses the physics, and a task may be read from any folder.
+  fields = dataclasses.asdict(config)
+  return _crc32({k: x for k, x in fields.items() if k not in ("backend", "task_file")})
+
+
+def _crc32(value: Any) -> int:
+  return zlib.crc32(json.dumps(value, sort_keys=True).encode())
