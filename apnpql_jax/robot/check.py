@@ -46,18 +46,16 @@ def check(
     act, loaded = policy_process.load_program(policy, seed=0), True
   with contextlib.ExitStack() as stack:
     robot = stack.enter_context(simulated.started(robot))
-    joints = check_devices.arm(stack, table, robot, policy.neutral)
-    gripper = check_devices.gripper(stack, table, robot)
-    frames = check_devices.cameras(stack, table, robot)
     senses = check_program.Senses(
-      joints, gripper, frames or (lambda: check_program.dark(robot))
+      check_devices.arm(stack, table, robot, policy.neutral),
+      check_devices.gripper(stack, table, robot),
+      check_devices.cameras(stack, table, robot),
     )
     with table.row("program"):
       seconds, ages = check_program.try_out(act, robot, senses)
       if loaded:
         check_program.report(table, robot, seconds)
-      if frames:
-        check_devices.ages(table, robot, ages)
+      check_devices.ages(table, robot, ages)
   table.rows["admittance"] = _contacts(policy, robot) if admittance else "off"
   return table.result()
 

@@ -52,7 +52,7 @@ def arm(
       table.fail("tool", f"{outside}: move the arm by hand")
     elif obstruction := limiter.obstruction(neutral):
       table.fail("tool", obstruction)
-    return lambda: device.get_observation().position
+    return table.guarded("arm", lambda: device.get_observation().position, neutral)
   return lambda: neutral
 
 
@@ -63,14 +63,13 @@ def gripper(stack: Stack, table: Table, robot: Robot) -> Callable[[], float]:
     stack.enter_context(devices.connected(device))
     angle = device.get_observation().angle
     table.rows["gripper"] = f"{_text(device)}; at {angle:.2f} rad"
-    return lambda: device.get_observation().angle
+    return table.guarded("gripper", lambda: device.get_observation().angle, angle)
   return lambda: 0.0
 
 
-def cameras(
-  stack: Stack, table: Table, robot: Robot
-) -> Callable[[], Sequence[Frame]] | None:
-  """Adds a row for each camera; returns what gives their frames, if all work."""
+def cameras(stack: Stack, table: Table, robot: Robot) -> Callable[[], Sequence[Frame]]:
+  """Adds a row for each camera; returns what gives a frame of each."""
+  dark = _dark(robot)
   with table.row("cameras"):
     opened = stack.enter_context(devices.open_cameras(robot))
     for camera in opened:
@@ -83,12 +82,14 @@ def cameras(
           f"{view['width']} pixels"
         )
       table.rows[f"camera {name}"] = _text(camera)
-    return lambda: [camera.get_observation() for camera in opened]
-  return None
+    return table.guarded("cameras", lambda: [x.get_observation() for x in opened], dark)
+  return lambda: dark
 
 
 def ages(table: Table, robot: Robot, found: np.ndarray) -> None:
-  """Adds the ages of the frames to their rows, f64[2], s."""
+  """Adds the ages of the frames to their rows, f64[2], s, if there are frames."""
+  if "cameras" in table.failing:
+    return
   most = robot.cell.limits(robot.contract).frame_age
   for name, age in zip(CAMERAS, found, strict=True):
     row, text = f"camera {name}", f"frames of {1e3 * age:.0f} ms when it acts"
@@ -96,6 +97,13 @@ def ages(table: Table, robot: Robot, found: np.ndarray) -> None:
       table.fail(row, f"{text}, the limit is {1e3 * most:.0f} ms")
     else:
       table.rows[row] += f"; {text}"
+
+
+def _dark(robot: Robot) -> Sequence[Frame]:
+  """Returns black frames."""
+  views, now = robot.contract["cameras"], robot.clock.now()
+  sizes = [(views[name]["height"], views[name]["width"], 3) for name in CAMERAS]
+  return [Frame(now, np.zeros(size, np.uint8)) for size in sizes]
 
 
 def _newest(robot: Robot, device: Any) -> tuple[ArmState, float]:

@@ -16,7 +16,6 @@ from apnpql_jax.robot.check_table import Table
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.player import Act, Observer
 from apnpql_jax.robot.protocols import Frame
-from apnpql_jax.robot.supervisor import CAMERAS
 
 _INSTANTS = 10
 _ACTION = (7,)
@@ -33,14 +32,7 @@ class Senses:
   """Angle of the driven finger, rad."""
 
   frames: Callable[[], Sequence[Frame]]
-  """Newest frame of each of ``CAMERAS``."""
-
-
-def dark(robot: Robot) -> Sequence[Frame]:
-  """Returns new black frames, in place of cameras that do not work."""
-  views, now = robot.contract["cameras"], robot.clock.now()
-  sizes = [(views[name]["height"], views[name]["width"], 3) for name in CAMERAS]
-  return [Frame(now, np.zeros(size, np.uint8)) for size in sizes]
+  """Newest frame of each camera."""
 
 
 def rest(observation: dict[str, np.ndarray], episode: int, instant: int) -> np.ndarray:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 import contextlib
-from typing import Any
+from typing import Any, TypeVar
 
 from apnpql_jax.console import print_line
 from apnpql_jax.errors import UserError, one_line
+
+T = TypeVar("T")
 
 NOT_READY = 2
 """Exit code if a row fails."""
@@ -22,12 +24,13 @@ class Table:
     self.failing: list[str] = []
 
   def fail(self, name: str, problem: str) -> None:
-    """Sets a row that fails, or adds a problem to one that does."""
-    if name in self.failing:
+    """Sets a row that fails, or adds a new problem to one that does."""
+    problem = problem.removeprefix(f"{name}: ")
+    if name not in self.failing:
+      self.failing.append(name)
+      self.rows[name] = f"FAILS: {problem}"
+    elif problem not in self.rows[name]:
       self.rows[name] += f"; {problem}"
-      return
-    self.rows[name] = f"FAILS: {problem}"
-    self.failing.append(name)
 
   @contextlib.contextmanager
   def row(self, name: str) -> Generator[None]:
@@ -36,6 +39,16 @@ class Table:
       yield
     except UserError as error:
       self.fail(name, one_line(error))
+
+  def guarded(self, name: str, read: Callable[[], T], instead: T) -> Callable[[], T]:
+    """Returns ``read``; if it fails, so does the row, and there is ``instead``."""
+
+    def call() -> T:
+      with self.row(name):
+        return read()
+      return instead
+
+    return call
 
   def result(self) -> dict[str, Any]:
     """Returns the rows, and if some fail, their names and the exit code."""

@@ -18,12 +18,15 @@ from typing import Any
 import numpy as np
 
 from apnpql_jax.config import files
+from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot import policy_folder, setup
 from apnpql_jax.robot.board import PERIOD_BIN_S
 from apnpql_jax.robot.episodes import Options
 from apnpql_jax.robot.session import Session
 from apnpql_jax.testing import SMALL, export_untrained
 from benchmarks.common import command
+
+_TRIES = 20
 
 
 def main() -> None:
@@ -56,7 +59,7 @@ def measure(path: Path, actions: int, kind: str, slowdown: float) -> dict[str, A
   ):
     session.wait_until_ready()
     while len(delays) < actions:
-      session.go_home()
+      _go_home(session)
       before = session.board["state"].read()["periods"]
       outcome = session.play(watch=lambda found: _note(delays, found))
       periods = periods + session.board["state"].read()["periods"] - before
@@ -75,6 +78,17 @@ def measure(path: Path, actions: int, kind: str, slowdown: float) -> dict[str, A
     "period_max_ms": _quantile(periods, 1.0),
     "episodes": {reason: stops.count(reason) for reason in stops},
   }
+
+
+def _go_home(session: Session) -> None:
+  """Goes home; again if a busy machine has stopped the arm on its way."""
+  for attempt in range(_TRIES):
+    try:
+      session.go_home()
+      return
+    except DeviceError:
+      if attempt == _TRIES - 1:
+        raise
 
 
 def _note(delays: dict[tuple[int, int], float], found: Any) -> None:

@@ -81,11 +81,15 @@ class Camera:
 
   view: dict[str, Any]
   age: float = 0.03
+  most: int = 1000
 
   def describe(self) -> dict[str, Any]:
     return {"model": "D435"}
 
   def get_observation(self) -> Frame:
+    self.most -= 1
+    if self.most < 0:
+      raise DeviceError("camera 12: sent no frame for 1.0 s")
     size = self.view["height"], self.view["width"], 3
     return Frame(time.monotonic() - self.age, np.zeros(size, np.uint8))
 
@@ -161,6 +165,10 @@ def stale_frames(bench: Bench) -> None:
   bench.cameras[1].age = 0.15
 
 
+def no_frames(bench: Bench) -> None:
+  bench.cameras[0].most = 4
+
+
 def small_images(bench: Bench) -> None:
   bench.cameras[0].view = {"height": 7, "width": 9}
 
@@ -197,6 +205,7 @@ def broken(bench: Bench) -> None:
     (joint_outside, "tool", "is outside its range"),
     (a_turn_away, "tool", "is outside the workspace box: first move the arm by hand"),
     (stale_frames, "camera wrist", "when it acts, the limit is 100 ms"),
+    (no_frames, "cameras", "FAILS: camera 12: sent no frame for 1.0 s"),
     (small_images, "cameras", "camera global: an image of (7, 9, 3), not 72 x 96"),
     (slow_program, "program", "per action, period 150 ms: use a faster machine"),
     (nan, "program", "its action is not finite"),
@@ -224,7 +233,24 @@ def test_a_device_that_is_missing_fails_alone(bench, monkeypatch):
   monkeypatch.setattr(devices, "make_gripper", nothing)
   found = bench.check()
   assert found["not_ready"] == ["gripper"]
-  assert found["gripper"] == "FAILS: gripper: could not open port /dev/nothing"
+  assert found["gripper"] == "FAILS: could not open port /dev/nothing"
+
+
+def test_a_gripper_that_falls_silent_fails_once_and_not_the_program(bench, monkeypatch):
+  class Failing(Gripper):
+    asked = 0
+
+    def get_observation(self) -> Any:
+      self.asked += 1
+      if self.asked > 3:
+        raise DeviceError("gripper: it does not answer")
+      return super().get_observation()
+
+  monkeypatch.setattr(devices, "make_gripper", lambda robot: Failing(np.zeros(6)))
+  found = bench.check()
+  assert found["not_ready"] == ["gripper"]
+  assert found["gripper"] == "FAILS: it does not answer"
+  assert found["program"].endswith("ms per action, period 150 ms")
 
 
 def test_a_real_arm_is_checked_before_its_calibration(bench, tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ import pytest
 
 from apnpql_jax.data import lerobot
 from apnpql_jax.errors import FileError
-from apnpql_jax.robot import recorder, replay
+from apnpql_jax.robot import policy_process, recorder, replay
 from apnpql_jax.robot.protocols import Frame
 
 pytest.importorskip("pyarrow")
@@ -51,13 +51,14 @@ def changed(*keys: str, value: Any) -> dict[str, Any]:
   return contract
 
 
-def log(folder: Path, actions: np.ndarray, contract: dict[str, Any] = CONTRACT) -> Path:
-  """Records an episode, as a run does."""
+def log(folder: Path, *episodes: np.ndarray, contract: Any = CONTRACT) -> Path:
+  """Records episodes, as a run does."""
   frames = [Frame(0.0, np.zeros((16, 16, 3), np.uint8))] * 2
   with recorder.Recorder(folder, contract, judged=False) as writer:
-    for action in actions:
-      writer.add(0.0, 0.0, STATE, action, frames)
-    writer.end_episode(None)
+    for actions in episodes:
+      for action in actions:
+        writer.add(0.0, 0.0, STATE, action, frames)
+      writer.end_episode(None)
   return folder
 
 
@@ -69,6 +70,17 @@ def velocities() -> np.ndarray:
 def test_a_log_of_the_same_policy_gives_its_actions(tmp_path):
   (actions,) = replay.recorded_actions(log(tmp_path / "log", velocities()), CONTRACT)
   np.testing.assert_array_equal(actions, velocities())
+
+
+def test_recorded_episodes_are_repeated_and_then_the_arm_stands_still(tmp_path):
+  folder, other = tmp_path / "log", 0.5 * velocities()[:3]
+  log(folder, velocities(), other)
+  act = policy_process.replaying(replay.recorded_actions(folder, CONTRACT))
+  for episode, expected in enumerate((velocities(), other, velocities())):
+    found = [act({}, episode, instant) for instant in range(len(expected))]
+    np.testing.assert_array_equal(found, expected)
+    rest = act({}, episode, len(expected))
+    np.testing.assert_array_equal(rest, [0, 0, 0, 0, 0, 0, expected[-1][6]])
 
 
 @pytest.mark.parametrize(
@@ -83,7 +95,7 @@ def test_a_log_of_the_same_policy_gives_its_actions(tmp_path):
   ],
 )
 def test_another_log_is_refused_with_the_difference(tmp_path, keys, value, message):
-  folder = log(tmp_path / "log", velocities(), changed(*keys, value=value))
+  folder = log(tmp_path / "log", velocities(), contract=changed(*keys, value=value))
   with pytest.raises(FileError, match=f"cannot be replayed: {message}") as error:
     replay.recorded_actions(folder, CONTRACT)
   assert "\n" not in str(error.value)

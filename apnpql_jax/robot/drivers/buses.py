@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import contextlib
 import importlib
+import os
 from typing import Any, Protocol
 
 from apnpql_jax.errors import DeviceError, one_line
@@ -65,7 +66,9 @@ class Dynamixel:
     try:
       self._port.setBaudRate(baud)  # Opens the port.
     except Exception as error:  # Those of pyserial, and of termios.
-      raise DeviceError(one_line(error)) from None
+      number = getattr(error, "errno", None)
+      cause = os.strerror(number) if number else one_line(error)
+      raise DeviceError(f"could not open port {port}: {cause}") from None
 
   def read(self, address: int, size: int) -> bytes:
     """See ``Bus``."""
