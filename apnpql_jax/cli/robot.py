@@ -127,8 +127,8 @@ def robot(args: Robot) -> dict[str, Any]:
 
 
 def _run(args: Robot, opened: Any, policy: Any) -> dict[str, Any]:
+  from apnpql_jax.robot.episodes import Options
   from apnpql_jax.robot.run import run
-  from apnpql_jax.robot.session import Options
 
   if args.robot == "ur5e" and not args.yes:
     _confirm(args)

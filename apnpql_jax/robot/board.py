@@ -2,22 +2,22 @@
 
 Each record has one writer. A reader takes a copy, and takes another one if its number
 or its checksum shows that the writer was at work. There are no locks, so a process that
-dies cannot hold up the others for long. Times are those of ``time.monotonic``,
-which all processes of a machine share.
+dies, even within a write, does not hold up the others: they keep the last whole copy,
+whose time shows its age. Times are those of ``time.monotonic``, which all processes of
+a machine share.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+import contextlib
 import enum
 from multiprocessing import shared_memory
-import time
 from typing import Any
+import weakref
 import zlib
 
 import numpy as np
-
-from apnpql_jax.errors import DeviceError
 
 PERIOD_BINS, PERIOD_BIN_S = 64, 0.00025
 """Histogram of the periods of the control loop: number and width (s) of its bins."""
@@ -55,12 +55,15 @@ RECORDS = {
     ("wrench", "f8", 6),
     ("command", "f8", 6),
     ("gripper", "f8"),
+    ("gripper_time", "f8"),
     ("mode", "i8"),
     ("reason", TEXT),
     ("done", "i8"),
+    ("at_rest", "i8"),
     ("periods", "i8", PERIOD_BINS),
   ],
-  # From the policy process; "order" is that of the episode.
+  # From the policy process; "order" is that of the episode, "ended" that of the last
+  # one that has ended and is in the log, "index" its number there or -1.
   "action": [
     ("order", "i8"),
     ("number", "i8"),
@@ -72,15 +75,27 @@ RECORDS = {
     ("ready", "i8"),
     ("order", "i8"),
     ("actions", "i8"),
+    ("missed", "i8"),
     ("over", "i8"),
     ("solved", "i8"),
+    ("ended", "i8"),
+    ("index", "i8"),
     ("delay", "f8"),
     ("error", TEXT),
   ],
 }
 """Record -> its fields."""
 
-_TRIES = 1000
+_TRIES = 20
+"""Attempts to take a whole copy, some microseconds each; a write is about as long."""
+
+_HEAD = 16
+"""Bytes before the values: number of the copy, odd while it is written; checksum."""
+
+
+def text(value: Any) -> str:
+  """Returns a field of type ``TEXT`` as it can be shown, whatever its bytes."""
+  return bytes(value).decode(errors="replace")
 
 
 class Record:
@@ -89,41 +104,47 @@ class Record:
   def __init__(self, buffer: memoryview, fields: Any):
     """Lays the record over ``buffer``, see ``size``."""
     self._dtype = np.dtype(fields)
-    head = np.frombuffer(buffer, np.uint64, 2)
-    self._head, self._body = head, np.frombuffer(buffer, np.uint8, -1, 16)
+    # Views that can be let go of: arrays would keep the memory open.
+    self._head = buffer[:_HEAD].cast("Q")
+    self._body = buffer[_HEAD : _HEAD + self._dtype.itemsize]
     self._own: Any = np.zeros((), self._dtype)
+    self._good = self._own.tobytes()
 
   @staticmethod
   def size(fields: Any) -> int:
     """Returns the bytes of a record, a multiple of 64."""
-    return -(-(16 + np.dtype(fields).itemsize) // 64) * 64
+    return -(-(_HEAD + np.dtype(fields).itemsize) // 64) * 64
 
   def write(self, values: Mapping[str, Any]) -> None:
     """Changes the fields ``values`` and publishes the record."""
     for name, value in values.items():
-      self._own[name] = value.encode()[:200] if isinstance(value, str) else value
+      self._own[name] = _bytes(value) if isinstance(value, str) else value
     data = self._own.tobytes()
     self._head[0] += 1  # Odd: being written.
-    self._body[: len(data)] = np.frombuffer(data, np.uint8)
+    self._body[:] = data
     self._head[1] = zlib.crc32(data)
     self._head[0] += 1
 
   def read(self) -> Any:
-    """Returns a copy of the newest whole record, by field; text is in bytes."""
-    for attempt in range(_TRIES):
-      number = int(self._head[0])
-      data = self._body[: self._dtype.itemsize].tobytes()
+    """Returns a copy of the newest whole record, by field; see ``text``.
+
+    It is the last one that this reader took if the writer stays at work, or has died
+    there; zeros if there was none.
+    """
+    for _ in range(_TRIES):
+      number = self._head[0]
+      data = bytes(self._body)
       whole = number % 2 == 0 and number == self._head[0]
       # The checksum also covers processors that reorder writes.
-      if whole and (number == 0 or self._head[1] == zlib.crc32(data)):
-        return np.frombuffer(data, self._dtype)[0]
-      if attempt > 10:
-        time.sleep(1e-5)
-    raise DeviceError("shared memory: a record stayed half-written; run again")
+      if whole and number and self._head[1] == zlib.crc32(data):
+        self._good = data
+        break
+    return np.frombuffer(self._good, self._dtype)[0]
 
   def close(self) -> None:
     """Lets go of the memory."""
-    del self._head, self._body
+    self._head.release()
+    self._body.release()
 
 
 class Board:
@@ -133,17 +154,20 @@ class Board:
     """Makes a board, or opens the one with this name; see ``RECORDS``."""
     records = RECORDS if records is None else records
     sizes = {key: Record.size(fields) for key, fields in records.items()}
-    self._made = name is None
-    self._memory = shared_memory.SharedMemory(
-      name, create=self._made, size=sum(sizes.values())
+    memory = shared_memory.SharedMemory(
+      name, create=name is None, size=sum(sizes.values())
     )
-    start, buffer = 0, self._memory.buf
+    self._memory, self._records = memory, {}
+    buffer = memory.buf
     assert buffer is not None
-    self._records: dict[str, Record] = {}
+    start = 0
     for key, fields in records.items():
-      part = buffer[start : start + sizes[key]]
-      self._records[key] = Record(part, fields)
+      with buffer[start : start + sizes[key]] as part:
+        self._records[key] = Record(part, fields)
       start += sizes[key]
+    # Also at the exit of the interpreter, whose order of destruction is not ours.
+    made = name is None
+    self._close = weakref.finalize(self, _let_go, memory, self._records, made)
 
   @property
   def name(self) -> str:
@@ -155,18 +179,27 @@ class Board:
 
   def close(self) -> None:
     """Lets go of the memory, and removes it if this process has made it."""
-    for record in self._records.values():
-      record.close()
-    self._records = {}
-    try:
-      self._memory.close()
-    except BufferError:  # A copy of the view is still alive; the memory goes with it.
-      pass
-    if self._made:
-      self._memory.unlink()
+    self._close()
 
   def __enter__(self) -> Board:
     return self
 
   def __exit__(self, *error: object) -> None:
     self.close()
+
+
+def _let_go(
+  memory: shared_memory.SharedMemory, records: Mapping[str, Record], made: bool
+) -> None:
+  for record in records.values():
+    record.close()
+  memory.close()
+  if made:
+    with contextlib.suppress(FileNotFoundError):  # Whoever ends this process may.
+      memory.unlink()
+
+
+def _bytes(line: str) -> bytes:
+  """Returns a line for a field of type ``TEXT``, cut between two characters."""
+  size = np.dtype(TEXT).itemsize
+  return line.encode()[:size].decode(errors="ignore").encode()

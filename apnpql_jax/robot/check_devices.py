@@ -47,8 +47,11 @@ def arm(
     tool = ", ".join(f"{x:.3f}" for x in model.tool_position(state.position))
     table.rows["force"] = f"({force}) N in the world, before it is zeroed"
     table.rows["tool"] = f"at ({tool}) m, inside the workspace box"
-    if outside := MotionLimiter(limits, model.tool_position).start(state.position):
+    limiter = MotionLimiter(limits, model.tool_position)
+    if outside := limiter.start(state.position):
       table.fail("tool", f"{outside}: move the arm by hand")
+    elif obstruction := limiter.obstruction(neutral):
+      table.fail("tool", obstruction)
     return table.guarded("arm", lambda: device.get_observation().position, neutral)
   return lambda: neutral
 

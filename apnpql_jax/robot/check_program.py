@@ -14,7 +14,7 @@ import numpy as np
 from apnpql_jax.errors import DeviceError, one_line
 from apnpql_jax.robot.check_table import Table
 from apnpql_jax.robot.devices import Robot
-from apnpql_jax.robot.policy_process import Act, Observer
+from apnpql_jax.robot.player import Act, Observer
 from apnpql_jax.robot.protocols import Frame
 
 _INSTANTS = 10

@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 
 from apnpql_jax.console import print_line
 from apnpql_jax.errors import UserError, one_line
-from apnpql_jax.robot import devices
 
 T = TypeVar("T")
 
@@ -37,8 +36,7 @@ class Table:
   def row(self, name: str) -> Generator[None]:
     """Turns an error for the user into a row that fails."""
     try:
-      with devices.needing_packages():
-        yield
+      yield
     except UserError as error:
       self.fail(name, one_line(error))
 

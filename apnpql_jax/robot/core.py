@@ -109,7 +109,8 @@ class Core:
     if mode is Mode.FOLLOW and far > _ARRIVED:
       slowing = 0.5 * self.limits.acceleration
       speed = np.abs(limiter.velocity).max() + slowing * TIMESTEP
-      speed = min(speed, HOME_SPEED, np.sqrt(2 * slowing * far), far / TIMESTEP)
+      most = min(HOME_SPEED, self.limits.velocity)
+      speed = min(speed, most, np.sqrt(2 * slowing * far), far / TIMESTEP)
       limiter.step(gap / far * speed, state.position)
     else:
       limiter.brake(self._measured(now, state))

@@ -20,17 +20,6 @@ from apnpql_jax.robot.supervisor import CAMERAS
 
 ROBOTS = ("ur5e", "simulated", "double")
 
-_PACKAGES = {
-  "rtde_control": "ur_rtde",
-  "rtde_receive": "ur_rtde",
-  "dynamixel_sdk": "dynamixel-sdk",
-  "pyrealsense2": "pyrealsense2",
-  "pymodbus": "pymodbus",
-  "cv2": "opencv-contrib-python-headless",
-  "pyarrow": "pyarrow",
-}
-"""Modules that drivers import -> package that has them."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Robot:
@@ -50,6 +39,11 @@ class Robot:
 
   plant: str = ""
   """Name of the shared memory of a simulated plant."""
+
+  @property
+  def can_judge(self) -> bool:
+    """Whether it shows that the task is solved; no sensor of a real arm does."""
+    return self.kind == "simulated"
 
 
 def make_arm(robot: Robot, *, reads: bool = False) -> Any:
@@ -81,10 +75,9 @@ def open_arm(robot: Robot) -> Generator[tuple[Arm, Gripper]]:
   """Connects arm and gripper; nothing moves.
 
   Raises:
-    DeviceError: A device is missing, silent or another one.
-    ConfigError: A package is missing.
+    DeviceError: A device is missing, silent or another one, or a package is missing.
   """
-  with needing_packages(), contextlib.ExitStack() as stack:
+  with contextlib.ExitStack() as stack:
     arm, gripper = make_arm(robot), make_gripper(robot)
     for device in (arm, gripper):
       stack.enter_context(connected(device))
@@ -104,7 +97,7 @@ def connected(device: Device) -> Generator[None]:
 @contextlib.contextmanager
 def open_cameras(robot: Robot) -> Generator[Sequence[Camera]]:
   """Connects the cameras, in the order of ``supervisor.CAMERAS``; see ``open_arm``."""
-  with needing_packages(), contextlib.ExitStack() as stack:
+  with contextlib.ExitStack() as stack:
     views = robot.contract["cameras"]
     if robot.kind == "simulated":
       rendered = importlib.import_module("apnpql_jax.robot.simulated_cameras")
@@ -150,20 +143,6 @@ def calibrated_modes(robot: Robot) -> dict[str, Any]:
     for name, camera in found.cameras.items()
     if camera.about.get("lens_from") == "views"
   }
-
-
-@contextlib.contextmanager
-def needing_packages() -> Generator[None]:
-  """Turns a missing package of a vendor into one line that names the cure."""
-  try:
-    yield
-  except ModuleNotFoundError as error:
-    name = (error.name or "").partition(".")[0]
-    if name not in _PACKAGES:
-      raise
-    raise ConfigError(
-      f"robot needs {_PACKAGES[name]}: pip install 'apnpql-jax[robot]'"
-    ) from error
 
 
 def leave_interrupts_to_the_main_process() -> None:

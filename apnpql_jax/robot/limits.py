@@ -96,6 +96,13 @@ class Limits:
   joint_age: float = 0.02
   """Age of the measured joints from which the arm stops, s."""
 
+  gripper_age: float = 0.3
+  """Age of the gripper's measurement from which the arm stops, s.
+
+  Its line is slow: a message takes up to 20 ms, and the settings that go with the first
+  command are about ten. A driver that notices silence itself stops the arm earlier.
+  """
+
   period: float = 0.15
   """Control period of the policy, s. One period late the arm holds, two it stops."""
 

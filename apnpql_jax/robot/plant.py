@@ -79,8 +79,13 @@ class Plant:
     self.data.qpos[self._qpos], self.data.qvel[self._dof] = position, 0.0
     self._settle()
 
-  def step(self, target: np.ndarray | None, close: bool) -> None:
-    """Advances by 2 ms; the arm keeps its place without a ``target`` f64[6]."""
+  def step(self, target: np.ndarray | None, close: bool | None) -> None:
+    """Advances by 2 ms.
+
+    Args:
+      target: Joint angles to follow f64[6]; without, the arm keeps its place.
+      close: Whether the gripper closes or opens; without, the fingers keep theirs.
+    """
     model, data, servo = self.model, self.data, self.servo
     self._queue.append(self._queue[-1] if target is None else np.array(target))
     arriving = self._queue[0]
@@ -96,7 +101,11 @@ class Plant:
     torque = mass[np.ix_(self._dof, self._dof)] @ wanted + data.qfrc_bias[self._dof]
     data.ctrl[: len(JOINTS)] = torque.clip(-self._limit, self._limit)
     data.ctrl[len(JOINTS)] = motors.gripper_torque(
-      data.qpos[self._finger], data.qvel[self._finger_dof], float(close), np
+      data.qpos[self._finger],
+      data.qvel[self._finger_dof],
+      float(bool(close)),
+      np,
+      speed=0.0 if close is None else motors.GRIPPER_SPEED,
     )
     mujoco.mj_step1(model, data)
     mujoco.mj_step2(model, data)

@@ -103,7 +103,14 @@ class Gripper(Device, Protocol):
     ...
 
   def send_action(self, close: bool) -> None:
-    """Closes or opens; repeating a command changes nothing."""
+    """Closes or opens, without waiting; repeating a command changes nothing."""
+    ...
+
+  def hold(self) -> None:
+    """Stops the fingers at their present angle, without waiting.
+
+    Fingers that press on something thereby lose most of their force.
+    """
     ...
 
 

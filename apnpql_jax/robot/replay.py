@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from apnpql_jax.data import lerobot
 from apnpql_jax.errors import FileError
-from apnpql_jax.robot import recorder
 
 Json = dict[str, Any]
 
@@ -34,7 +34,7 @@ def recorded_actions(folder: Path, contract: Json) -> list[np.ndarray]:
     FileError: It is no log, or differs from the contract; the message names the
       difference.
   """
-  dataset = recorder.lerobot().read(folder)
+  dataset = lerobot.read(folder)
   actions = [np.asarray(episode.actions, float) for episode in dataset.episodes]
   if not actions:
     raise FileError(f"{str(folder)!r} has no episodes")
@@ -52,7 +52,7 @@ def _difference(dataset: Any, contract: Json) -> str:
   for task in (episode.task for episode in dataset.episodes):
     if task != contract["task"]:
       return f"its task is {task!r}, the policy's {contract['task']!r}"
-  names = dataset.names.get(recorder.lerobot().ACTION)
+  names = dataset.names.get(lerobot.ACTION)
   if names != wanted["order"]:
     return f"its actions are of {names}, the policy's of {wanted['order']}"
   own = _actions_of(dataset.about.get("contract"))

@@ -11,11 +11,19 @@ import signal
 from typing import Any
 
 from apnpql_jax.console import print_line
-from apnpql_jax.errors import DeviceError, FileError
+from apnpql_jax.errors import (
+  FAILED,
+  DeviceError,
+  FileError,
+  RunStopped,
+  UserError,
+  one_line,
+)
 from apnpql_jax.robot import recorder, replay
 from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.episodes import Options, Outcome
 from apnpql_jax.robot.policy_folder import PolicyFolder
-from apnpql_jax.robot.session import Options, Outcome, Session
+from apnpql_jax.robot.session import Session
 from apnpql_jax.robot.supervisor import NO_ACTION
 from apnpql_jax.runs.metrics import wilson_interval
 
@@ -31,13 +39,14 @@ def run(
   A fault ends its episode, and the next one begins, unless the arm cannot go home.
 
   Returns:
-    Counts, reasons, and the success rate if a simulated robot can judge it.
+    Counts, reasons, and the success rate if a simulated robot can judge it. If the
+    session ends before its last episode, also ``failure`` and ``exit_code``.
 
   Raises:
     ConfigError: A package is missing.
     FileError: The log exists, or the one to replay is none or not of this policy.
-    DeviceError: A device or process has failed.
-    RunStopped: SIGINT, SIGTERM or SIGHUP came; the arm is at rest.
+    DeviceError: A device or process has failed before the arm moved.
+    RunStopped: SIGINT, SIGTERM or SIGHUP came; with what is known about the arm.
   """
   if options.log is not None:
     recorder.check_available()
@@ -46,26 +55,44 @@ def run(
   if options.replay is not None:
     replay.recorded_actions(Path(options.replay), policy.contract)
   outcomes: list[Outcome] = []
-  failure = ""
-  with contextlib.ExitStack() as stack:
-    caught = stack.enter_context(catching_signals())
-    session = stack.enter_context(Session(robot, policy, options, caught))
-    session.wait_until_ready()
+  with catching_signals() as caught:
+    session = Session(robot, policy, options, caught)
     try:
-      for episode in range(episodes):
-        session.go_home()
-        outcomes.append(session.play())
-        _report(episode, episodes, outcomes[-1])
-        _keep(options.log, outcomes[-1])
-        if robot.kind == "ur5e" and outcomes[-1].stopped:
-          # It may press on something, and would move home next.
-          raise DeviceError("look at the arm after a stop, then start again")
-    except DeviceError as error:
-      if not outcomes:
-        raise
-      failure = str(error)
-      print_line(f"the session ends after {len(outcomes)} episodes: {failure}")
-  return _summary(robot, options, outcomes, failure)
+      with session:
+        session.wait_until_ready()
+        failure = _play(session, robot, options, outcomes, episodes)
+    except RunStopped as stop:
+      raise RunStopped(f"{stop}: {session.rest}", stop.code) from None
+  if failure:
+    count = f"{len(outcomes)} of {episodes} episodes"
+    print_line(f"the session ends after {count}: {failure}; {session.rest}")
+  return _summary(robot, options, outcomes, failure) | {"arm": session.rest}
+
+
+def _play(
+  session: Session,
+  robot: Robot,
+  options: Options,
+  outcomes: list[Outcome],
+  episodes: int,
+) -> str:
+  """Adds an outcome for each episode; returns what has ended them before their number.
+
+  The arm has moved by then, so that no failure is one of bad input any more.
+  """
+  try:
+    for episode in range(episodes):
+      session.go_home()
+      outcomes.append(session.play())
+      _report(episode, episodes, outcomes[-1])
+      _keep(options.log, outcomes[-1])
+      session.check()
+      if robot.kind == "ur5e" and outcomes[-1].stopped:
+        # It may press on something, and would move home next.
+        raise DeviceError("look at the arm after a stop, then start again")
+  except (UserError, OSError) as error:
+    return one_line(error)
+  return ""
 
 
 @contextlib.contextmanager
@@ -92,9 +119,11 @@ def _report(episode: int, episodes: int, outcome: Outcome) -> None:
   holds = sum(
     mode == "hold" and reason != NO_ACTION for _, mode, reason in outcome.events
   )
+  counts = {"missed periods": outcome.missed_periods, "late cycles": outcome.overruns}
+  late = "".join(f", {n} {name}" for name, n in counts.items() if n)
   print_line(
     f"episode {episode + 1} of {episodes}: {outcome.reason}, {outcome.seconds:.1f} s, "
-    f"{outcome.actions} actions, {holds} holds"
+    f"{outcome.actions} actions, {holds} holds{late}"
   )
 
 
@@ -115,6 +144,8 @@ def _summary(
     "reasons": [x.reason for x in outcomes],
     "actions": sum(x.actions for x in outcomes),
     "seconds": sum(x.seconds for x in outcomes),
+    "missed_periods": sum(x.missed_periods for x in outcomes),
+    "overruns": sum(x.overruns for x in outcomes),
   }
   judged = [x.solved for x in outcomes if x.solved is not None]
   if judged:
@@ -127,5 +158,5 @@ def _summary(
   if options.log is not None:
     found["log"] = options.log
   if failure:
-    found |= {"failure": failure, "exit_code": 3}
+    found |= {"failure": failure, "exit_code": FAILED}
   return found

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import contextlib
-import dataclasses
-from multiprocessing import get_context
 import signal
-import time
 from typing import Any
 
 import numpy as np
 
 from apnpql_jax.errors import INTERRUPTED, DeviceError, RunStopped
-from apnpql_jax.robot import control_process, policy_process, simulated
-from apnpql_jax.robot.board import Board, Phase
+from apnpql_jax.robot import policy_process, simulated
+from apnpql_jax.robot.board import PERIOD_BIN_S, Board, Phase, text
 from apnpql_jax.robot.devices import Robot
-from apnpql_jax.robot.limits import Limits
+from apnpql_jax.robot.episodes import SOLVED, TIME_LIMIT, Options, Outcome
+from apnpql_jax.robot.limits import TIMESTEP, Limits
+from apnpql_jax.robot.orders import Orders, comes_true
 from apnpql_jax.robot.policy_folder import PolicyFolder
+from apnpql_jax.robot.processes import Processes
 from apnpql_jax.robot.supervisor import Mode
 
 START_S = 600.0
@@ -26,54 +26,10 @@ START_S = 600.0
 HOME_S = 60.0
 """Time of the session that the way to the neutral pose may take."""
 
-SOLVED, TIME_LIMIT = "solved", "time limit"
+END_S = policy_process.END_S
+"""Time that the policy process may take to write an episode, s."""
 
-_LOOK_S = 0.01  # Between two looks at the board.
-
-
-@dataclasses.dataclass(frozen=True)
-class Options:
-  """How a session runs."""
-
-  seed: int = 0
-  """Random seed of the policy and of simulated reset states."""
-
-  admittance: bool = True
-  """Whether contacts move the virtual arm."""
-
-  latency_s: float = 0.0
-  """Delay of commands to a simulated arm, s."""
-
-  log: str | None = None
-  """Folder of the log to write."""
-
-  replay: str | None = None
-  """Log whose actions to repeat instead of the policy's."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Outcome:
-  """What became of an episode."""
-
-  solved: bool | None
-  """Whether the task was solved; None if no sensor can tell."""
-
-  reason: str
-  """solved, time limit, or why the arm stopped."""
-
-  actions: int
-  """Number of the policy's actions."""
-
-  seconds: float
-  """Duration."""
-
-  events: list[tuple[float, str, str]]
-  """Changes of the mode: time since the beginning in s, mode, reason."""
-
-  @property
-  def stopped(self) -> bool:
-    """Whether a fault ended it."""
-    return self.reason not in (SOLVED, TIME_LIMIT)
+UNKNOWN = "the arm's controller holds; its state is unknown"
 
 
 class Session(contextlib.AbstractContextManager):
@@ -88,29 +44,41 @@ class Session(contextlib.AbstractContextManager):
   ):
     """Starts the processes; ``wait_until_ready`` follows.
 
-    All methods raise ``RunStopped`` as soon as there are ``signals``, a list that
-    grows; leave the context then.
+    Methods raise ``RunStopped`` as soon as there are ``signals``, a list that grows;
+    leave the context then.
     """
     self._signals = signals
     self._policy, self._clock = policy, robot.clock
-    self._judged = robot.kind == "simulated"
-    self._number = self._scene = 0
+    self._judged = robot.can_judge
+    self._scene = 0
     self._events: list[tuple[float, str, str]] = []
-    self._failure = ""
+    self._failure, self._moved = "", False
+    self.rest = "the arm has not moved"
+    """What is known about the arm after ``close``."""
     self._stack = contextlib.ExitStack()
-    self._context = get_context("spawn")
     self.board = self._stack.enter_context(Board())
+    self._orders = Orders(self.board)
     self._plant: Board | None = None
-    self.processes: dict[str, Any] = {}
-    """Running processes by name: control and policy."""
+    self.processes: Processes | None = None
+    """The control and the policy process."""
     try:
-      if self._judged:
+      if robot.kind == "simulated":
         started = simulated.started(
           robot, seed=options.seed, latency_s=options.latency_s
         )
         robot = self._stack.enter_context(started)
         self._plant = self._stack.enter_context(simulated.opened(robot))
-      self._start(robot, options)
+      self.processes = Processes(
+        robot,
+        self.board.name,
+        control={"admittance": options.admittance},
+        policy={
+          "policy": str(policy.path),
+          "seed": options.seed,
+          "log": options.log,
+          "replay": options.replay,
+        },
+      )
     except BaseException:
       self.close()
       raise
@@ -127,111 +95,90 @@ class Session(contextlib.AbstractContextManager):
     self._wait(self._is_ready, START_S, "the robot to get ready")
 
   def go_home(self) -> None:
-    """Moves the arm to the neutral pose of the policy.
+    """Moves the arm to the neutral pose of the policy, and the gripper as it begins.
 
     A simulated arm that presses on something is freed first, as a person would do.
 
     Raises:
       DeviceError: It cannot get there, or a process has ended.
     """
-    policy = self._policy
+    policy, wait = self._policy, HOME_S * self._clock.slowdown
     force = np.linalg.norm(self.board["state"].read()["wrench"][:3])
     if self._plant is not None and force > Limits.hold_force:
       self._park(self._plant)
-    self._order(Phase.HOME, target=policy.neutral, close=int(policy.begins_closed))
-    self._wait(self._is_done, HOME_S * self._clock.slowdown, "the arm to go home")
+    begin = {"target": policy.neutral, "close": int(policy.begins_closed)}
+    self._moved = True
+    self._orders.give(Phase.HOME, **begin)
+    self._wait(lambda: self._orders.done, wait, "the arm to go home")
     state = self.board["state"].read()
     if state["mode"] == Mode.STOP:
-      raise DeviceError(
-        f"the arm does not reach its neutral pose: {state['reason'].decode()}"
-      )
+      raise DeviceError(f"no episode can begin: {text(state['reason'])}")
 
   def play(self, watch: Callable[[Any], None] | None = None) -> Outcome:
     """Plays an episode from the neutral pose; ``watch`` gets the records "policy".
 
+    A signal, or what fails meanwhile, ends it as well and is its reason. ``check`` then
+    raises it.
+
     Raises:
-      DeviceError: A process has ended.
+      DeviceError: A process has ended before the episode.
     """
     if self._plant is not None:
       self._new_scene(self._plant)
     self._take_events()
     self._events.clear()
-    begin = self._clock.now()
-    number = self._order(Phase.PLAY)
-
-    def over() -> bool:
-      policy = self.board["policy"].read()
-      if watch is not None:
-        watch(policy)
-      return self._is_done() or bool(policy["order"] == number and policy["over"])
-
-    limit = 2 * self._policy.contract["time_limit_s"] + 60
-    self._wait(over, limit * self._clock.slowdown, "the episode to end")
+    begin, overruns = self._clock.now(), self._overruns()
+    number = self._orders.give(Phase.PLAY)
+    reason, whole = self._follow(number, watch)
     seconds = self._clock.now() - begin
-    stopped = self._is_done()
-    reason = self.board["state"].read()["reason"].decode() if stopped else ""
-
-    def policy_ended() -> bool:
-      """Returns true, too, if it has not begun, as after a stop in the first cycle."""
-      policy = self.board["policy"].read()
-      return policy["order"] != number or bool(policy["over"])
-
-    self._wait(policy_ended, 60.0, "the policy to end")
-    policy = self.board["policy"].read()
-    played = policy["order"] == number
-    self._order(Phase.IDLE)
-    self._wait(self._is_obeyed, 10.0 * self._clock.slowdown, "the arm to rest")
-    solved = bool(played and policy["solved"])
+    policy = self._ended(number)
     self._take_events()
+    solved = bool(policy["solved"])
     return Outcome(
-      solved=solved if self._judged else None,
+      solved=solved if self._judged and whole else None,
       reason=reason or (SOLVED if solved else TIME_LIMIT),
-      actions=int(policy["actions"]) if played else 0,
+      actions=int(policy["actions"]),
       seconds=seconds,
       events=[(t - begin, mode, why) for t, mode, why in self._events],
+      missed_periods=int(policy["missed"]),
+      overruns=self._overruns() - overruns,
+      dataset_index=int(policy["index"]) if policy["index"] >= 0 else None,
     )
+
+  def check(self) -> None:
+    """Raises what has ended the session: a signal or a failure.
+
+    Raises:
+      RunStopped: There was a signal, which is the message.
+      DeviceError: A device or process has failed, with its reason.
+    """
+    self._take_events()
+    if self._signals:
+      name = signal.Signals(self._signals[0]).name
+      raise RunStopped(name, INTERRUPTED + self._signals[0])
+    failure = self._failure or text(self.board["policy"].read()["error"])
+    if not failure and self._plant is not None:
+      failure = text(self._plant["plant"].read()["error"])
+    ended = self._running.ended
+    if failure or ended:
+      # The control process first brings the arm to rest.
+      self._running.join("control", 3.0 * self._clock.slowdown)
+      self._take_events()
+      self._failure = failure = self._failure or failure
+      raise DeviceError(failure or f"the {ended[0]} process has ended unexpectedly")
 
   def close(self) -> None:
-    """Brings the arm to rest and ends the processes."""
-    if self.processes:
-      self._order(Phase.QUIT)
-    for name in ("control", "policy"):
-      if name in self.processes:
-        self.processes[name].join(10.0)
-    for process in self.processes.values():
-      process.join(2.0)
-      if process.is_alive():
-        process.kill()
-        process.join()
-    self.processes = {}
+    """Brings the arm to rest and ends the processes; ``rest`` is what came of it."""
+    if self.processes is not None:
+      self._orders.give(Phase.QUIT)
+      self.processes.join("control", 10.0 * self._clock.slowdown)
+      if self._moved:
+        known = not self.processes.is_alive("control")
+        at_rest = known and self.board["state"].read()["at_rest"]
+        self.rest = "the arm is at rest" if at_rest else UNKNOWN
+      self.processes.end(0.0, END_S)
+      self.processes = None
     self._stack.close()
-
-  def _start(self, robot: Robot, options: Options) -> None:
-    self._receiver, sender = self._context.Pipe(duplex=False)
-    one, other = self._context.Pipe()
-    about = {"admittance": options.admittance}
-    self._spawn(
-      "control", control_process.main, robot, self.board.name, about, sender, one
-    )
-    about = {
-      "policy": str(self._policy.path),
-      "seed": options.seed,
-      "log": options.log,
-      "replay": options.replay,
-    }
-    self._spawn("policy", policy_process.main, robot, self.board.name, about, other)
-    for end in (sender, one, other):  # Each must be open in one process only.
-      end.close()
-
-  def _spawn(self, name: str, target: Callable[..., None], *args: Any) -> None:
-    process = self._context.Process(target=target, args=args, name=name, daemon=True)
-    process.start()
-    self.processes[name] = process
-
-  def _order(self, phase: Phase, **fields: Any) -> int:
-    self._number += 1
-    self.board["order"].write({"number": self._number, "phase": phase, **fields})
-    return self._number
 
   def _new_scene(self, plant: Board) -> None:
     """Places the objects of the next reset state."""
@@ -255,44 +202,82 @@ class Session(contextlib.AbstractContextManager):
     state, policy = (self.board[x].read() for x in ("state", "policy"))
     return bool(state["time"] and policy["ready"])
 
-  def _is_obeyed(self) -> bool:
-    return bool(self.board["state"].read()["number"] == self._number)
+  def _follow(
+    self, number: int, watch: Callable[[Any], None] | None
+  ) -> tuple[str, bool]:
+    """Waits for the end of an episode.
 
-  def _is_done(self) -> bool:
-    state = self.board["state"].read()
-    return bool(state["number"] == self._number and state["done"])
+    Returns:
+      Why it ended before its time, empty if it did not; and false if that was not in
+      the episode itself, but a signal or a failure.
+    """
+
+    def over() -> bool:
+      policy = self.board["policy"].read()
+      if watch is not None:
+        watch(policy)
+      return self._orders.done or bool(policy["order"] == number and policy["over"])
+
+    limit = 2 * self._policy.contract["time_limit_s"] + 60
+    try:
+      self._wait(over, limit * self._clock.slowdown, "the episode to end")
+    except (DeviceError, RunStopped) as error:
+      return str(error), False
+    reason = text(self.board["state"].read()["reason"]) if self._orders.done else ""
+    failed = self._running.ended or text(self.board["policy"].read()["error"])
+    return reason, not failed
+
+  def _ended(self, number: int) -> Any:
+    """Brings the arm to rest; returns the record "policy" once the episode is written.
+
+    The record is empty if the episode did not begin for the policy.
+    """
+    self._orders.give(Phase.IDLE)
+    if not comes_true(
+      lambda: self._orders.obeyed or not self._running.is_alive("control"),
+      10.0 * self._clock.slowdown,
+    ):
+      self._failure = self._failure or "robot: the arm does not come to rest"
+
+    def written() -> bool:
+      found = self.board["policy"].read()
+      begun = found["order"] == number and self._running.is_alive("policy")
+      return not begun or found["ended"] == number
+
+    if not comes_true(written, END_S):
+      self._failure = self._failure or "policy: it does not end its episode"
+    found = self.board["policy"].read()
+    if found["order"] == number:
+      return found
+    return dict.fromkeys(("actions", "missed", "solved"), 0) | {"index": -1}
+
+  def _overruns(self) -> int:
+    """Returns how many cycles have been late so far."""
+    late = round(2 * TIMESTEP / PERIOD_BIN_S)
+    return int(self.board["state"].read()["periods"][late:].sum())
 
   def _wait(self, condition: Callable[[], bool], seconds: float, purpose: str) -> None:
-    """Waits until a condition holds; raises ``DeviceError`` if a process fails."""
-    until = time.monotonic() + seconds
-    while not condition():
-      self._check_processes()
-      if time.monotonic() > until:
-        raise DeviceError(f"robot: waited {seconds:.0f} s in vain for {purpose}")
-      time.sleep(_LOOK_S)
+    """Waits until a condition holds; raises what ``check`` raises."""
 
-  def _check_processes(self) -> None:
-    self._take_events()
-    if self._signals:
-      name = signal.Signals(self._signals[0]).name
-      raise RunStopped(f"{name}: the arm is at rest", INTERRUPTED + self._signals[0])
-    failure = self._failure or self.board["policy"].read()["error"].decode()
-    if not failure and self._plant is not None:
-      failure = self._plant["plant"].read()["error"].decode()
-    ended = [name for name, x in self.processes.items() if not x.is_alive()]
-    if failure or ended:
-      # The control process first brings the arm to rest.
-      if "control" in self.processes:
-        self.processes["control"].join(3.0 * self._clock.slowdown)
-      self._take_events()
-      raise DeviceError(failure or f"the {ended[0]} process has ended unexpectedly")
+    def met() -> bool:
+      if condition():
+        return True
+      self.check()
+      return False
+
+    if not comes_true(met, seconds):
+      self._failure = f"robot: waited {seconds:.0f} s in vain for {purpose}"
+      raise DeviceError(self._failure)
 
   def _take_events(self) -> None:
     """Collects what the control process has reported."""
-    with contextlib.suppress(EOFError, OSError, AttributeError):
-      while self._receiver.poll(0):
-        event = self._receiver.recv()
-        if isinstance(event, str):
-          self._failure = self._failure or event
-        else:
-          self._events.append(event)
+    for event in self._running.events():
+      if isinstance(event, str):
+        self._failure = self._failure or event
+      else:
+        self._events.append(event)
+
+  @property
+  def _running(self) -> Processes:
+    assert self.processes is not None
+    return self.processes

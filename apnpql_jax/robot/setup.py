@@ -63,7 +63,7 @@ def doubled(robot: Robot) -> Generator[Robot]:
   if robot.kind != "double":
     yield robot
     return
-  with devices.needing_packages(), contextlib.ExitStack() as stack:
+  with contextlib.ExitStack() as stack:
     doubles = importlib.import_module("apnpql_jax.robot.doubles")
     server = doubles.serve(robot.contract["task"])
     stack.callback(server.close)

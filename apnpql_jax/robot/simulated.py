@@ -1,7 +1,6 @@
-"""The simulated robot: a ``Plant`` in a process of its own, and its arm and gripper.
+"""The simulated robot: its arm and gripper, and the start of its process.
 
-The process draws the reset states of the task, so it imports the task and with it JAX,
-but it runs nothing in JAX. The devices of this module import neither.
+They are on the board of the process, see ``simulation``; nothing here imports JAX.
 """
 
 from __future__ import annotations
@@ -9,56 +8,17 @@ from __future__ import annotations
 from collections.abc import Generator
 import contextlib
 import dataclasses
-import importlib
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context
 import time
 from typing import Any
 
 import numpy as np
 
 from apnpql_jax.errors import DeviceError
-from apnpql_jax.robot import devices
-from apnpql_jax.robot.board import TEXT, Board
-from apnpql_jax.robot.clock import Clock
+from apnpql_jax.robot.board import Board, text
 from apnpql_jax.robot.devices import Robot
-from apnpql_jax.robot.limits import TIMESTEP
-from apnpql_jax.robot.plant import Plant, Servo
 from apnpql_jax.robot.protocols import ArmState, GripperState
-
-_MOST = {"qpos": 128, "qvel": 128, "mocap_pos": 24, "mocap_quat": 32}
-"""Room for arrays of the scene."""
-
-RECORDS = {
-  # From the plant: its whole state, see ``Scene``.
-  "plant": [
-    ("ready", "i8"),
-    ("scene", "i8"),
-    ("parked", "i8"),
-    ("time", "f8"),
-    ("position", "f8", 6),
-    ("velocity", "f8", 6),
-    ("wrench", "f8", 6),
-    ("gripper", "f8"),
-    ("zeroed", "i8"),
-    ("variant", "i8"),
-    ("error", TEXT),
-    *((name, "f8", size) for name, size in _MOST.items()),
-  ],
-  "servo": [("follow", "i8"), ("target", "f8", 6), ("zero", "i8")],
-  "grip": [("close", "i8")],
-  # From the main process: the number of the reset state to show, and how often the arm
-  # was to be put back where it began.
-  "scene": [("number", "i8"), ("parked", "i8"), ("quit", "i8")],
-}
-
-_CATCH_UP_S = 0.02
-"""Delay that the plant makes up for; a longer one lets its time stand still."""
-
-_SETTLE_S = 0.5
-"""Time for which new objects come to rest."""
-
-PARKED = np.array([0.15, 0.1, -0.1, 0.1, 0.05, -0.1])
-"""Where the arm begins, rad from the neutral pose, so that it has to go there."""
+from apnpql_jax.robot.simulation import CLOSE, HOLD, OPEN, RECORDS, main
 
 
 class _OnBoard:
@@ -92,7 +52,7 @@ class SimulatedArm(_OnBoard):
   def get_observation(self) -> ArmState:
     """See ``Arm.get_observation``."""
     found = _opened(self._board)["plant"].read()
-    error = found["error"].decode()
+    error = text(found["error"])
     if error:
       raise DeviceError(f"simulated arm: {error}")
     return ArmState(
@@ -130,7 +90,11 @@ class SimulatedGripper(_OnBoard):
 
   def send_action(self, close: bool) -> None:
     """See ``Gripper.send_action``."""
-    _opened(self._board)["grip"].write({"close": int(close)})
+    _opened(self._board)["grip"].write({"command": CLOSE if close else OPEN})
+
+  def hold(self) -> None:
+    """See ``Gripper.hold``."""
+    _opened(self._board)["grip"].write({"command": HOLD})
 
 
 @contextlib.contextmanager
@@ -156,7 +120,7 @@ def started(robot: Robot, *, seed: int = 0, latency_s: float = 0.0) -> Generator
     process.start()
     try:
       while not board["plant"].read()["ready"]:
-        error = board["plant"].read()["error"].decode()
+        error = text(board["plant"].read()["error"])
         if error or not process.is_alive():
           raise DeviceError(f"simulated robot: {error or 'it does not start'}")
         time.sleep(0.01)
@@ -178,97 +142,3 @@ def _opened(board: Board | None) -> Board:
   if board is None:
     raise DeviceError("simulated robot: not connected")
   return board
-
-
-class Scene:
-  """A task's objects: reset states that are placed in the plant, and its state."""
-
-  def __init__(self, task: Any, *, seed: int):
-    """Keeps a ``tasks.Task``."""
-    self._task, self._rng = task, np.random.default_rng(seed)
-
-  def place(self, plant: Plant) -> int:
-    """Draws a reset state, places it, and returns the variant of its objects."""
-    draw = self._task.sample_resets(self._rng, 1)
-    variant = int(draw.variant[0])
-    for name, values in self._task.scene.variants.items():
-      getattr(plant.model, name)[...] = values[variant]
-    plant.place(draw.qpos[0], draw.mocap_pos[0], draw.mocap_quat[0])
-    return variant
-
-  def park(self, plant: Plant) -> None:
-    """Puts the arm near the neutral pose, as a person would free it."""
-    scene = self._task.scene
-    plant.put_arm(scene.keyframe("neutral")[scene.arm_qpos] + PARKED)
-
-  @staticmethod
-  def state_of(plant: Plant) -> dict[str, np.ndarray]:
-    """Returns the arrays of ``_MOST``, padded."""
-    found = {}
-    for name, size in _MOST.items():
-      values = np.asarray(getattr(plant.data, name)).reshape(-1)
-      found[name] = np.pad(values, (0, size - len(values)))
-    return found
-
-
-def main(name: str, task_name: str, options: dict[str, Any]) -> None:
-  """Runs the process of the plant.
-
-  Args:
-    name: Name of its board, with ``RECORDS``.
-    task_name: Name of the task.
-    options: ``seed`` of the reset states, ``latency_s``, ``clock``.
-  """
-  devices.leave_interrupts_to_the_main_process()
-  board = Board(name, RECORDS)
-  try:
-    tasks = importlib.import_module("apnpql_jax.tasks")
-    task = tasks.make_task(task_name)
-    servo = Servo(latency_s=options["latency_s"])
-    plant = Plant(task.scene.model, servo, seed=options["seed"])
-    _run(board, plant, Scene(task, seed=options["seed"]), options["clock"])
-  except Exception as error:  # Shown by the main process, which ends the session.
-    with contextlib.suppress(Exception):
-      board["plant"].write({"error": devices.reason(error)})
-  finally:
-    board.close()
-
-
-def _run(board: Board, plant: Plant, scene: Scene, clock: Clock) -> None:
-  parent, shown, zeroed, variant, since = parent_process(), 0, 0, 0, 0.0
-  parked = 0
-  scene.park(plant)
-  due = clock.now()
-  while parent is None or parent.is_alive():
-    servo, grip, order = (board[x].read() for x in ("servo", "grip", "scene"))
-    if order["quit"]:
-      return
-    if order["number"] != shown:
-      variant, shown, since = scene.place(plant), int(order["number"]), clock.now()
-    if order["parked"] != parked:
-      parked = int(order["parked"])
-      scene.park(plant)
-    if servo["zero"] != zeroed:
-      zeroed = int(servo["zero"])
-      plant.zero_force()
-    while due <= clock.now():
-      plant.step(servo["target"] if servo["follow"] else None, bool(grip["close"]))
-      due = max(due + TIMESTEP, clock.now() - _CATCH_UP_S)
-    now = clock.now()
-    state, settled = plant.arm_state(now), now - since > _SETTLE_S
-    board["plant"].write(
-      {
-        "ready": 1,
-        "scene": shown if settled else 0,
-        "parked": parked,
-        "time": state.time,
-        "position": state.position,
-        "velocity": state.velocity,
-        "wrench": state.wrench,
-        "gripper": plant.gripper_angle,
-        "zeroed": zeroed,
-        "variant": variant,
-        **scene.state_of(plant),
-      }
-    )
-    clock.sleep(due - clock.now())

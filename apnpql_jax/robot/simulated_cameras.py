@@ -17,7 +17,7 @@ from apnpql_jax.config import files
 from apnpql_jax.envs.cameras import make_cameras
 from apnpql_jax.robot.board import Board
 from apnpql_jax.robot.protocols import Frame
-from apnpql_jax.robot.simulated import RECORDS
+from apnpql_jax.robot.simulation import RECORDS
 from apnpql_jax.robot.supervisor import CAMERAS
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.kinematics import make_kinematics

@@ -13,7 +13,7 @@ import enum
 import numpy as np
 
 from apnpql_jax.robot.limits import Limits
-from apnpql_jax.robot.protocols import ArmState
+from apnpql_jax.robot.protocols import ArmState, GripperState
 
 CAMERAS = ("global", "wrist")
 
@@ -97,6 +97,12 @@ class Supervisor:
     if mode is Mode.FOLLOW and late:
       return Mode.HOLD, late
     return mode, reason
+
+  def check_gripper(self, now: float, gripper: GripperState) -> None:
+    """Ends the motion if the gripper has fallen silent."""
+    age = now - gripper.time
+    if not age <= self._limits.gripper_age:
+      self.stop(f"gripper: measurement is {1e3 * age:.0f} ms old")
 
   def judge_arm(
     self, now: float, state: ArmState, command: np.ndarray

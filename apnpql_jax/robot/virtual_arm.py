@@ -28,7 +28,7 @@ So every B > k tau is stable, for each mass. B is 25 m + D_c with the mass m tha
 tool feels along the contact; at the motors' limit of acceleration it is D_c alone. So
 D_c = 1.5 k tau is stable for walls of up to 1.5 k, whatever the policy commands. Where
 the arm rests with s < 1, it feels the stiffness s k and has the damping s D_c, so the
-same walls are stable there. If the damping set in without the slope, the contact would
+same walls are stable there. If the slope set in before the damping, the contact would
 buzz at the edge of the dead zone. The damping is integrated implicitly, because it may
 exceed m / TIMESTEP.
 """
@@ -169,7 +169,7 @@ class VirtualArm:
 
   @property
   def _damping(self) -> np.ndarray:
-    """Share of D_c: of translations (N s/m) and of rotations (N m s)."""
+    """Damping s D_c of translations (N s/m) and of rotations (N m s)."""
     assert self.admittance is not None
     return self.share * self.admittance.damping * np.array([1.0, DAMPED_RADIUS**2])
 

@@ -23,6 +23,10 @@ _GAP = 2  # black pixels between views
 _BORDER = 4  # width of a border in pixels
 _MACROBLOCK = 16  # video codecs need sides that are multiples of this
 
+CRISP, NOISY = 10, 28
+"""Rate factors of MP4: flat colors and hard edges need one below x264's default of 23,
+and the noise of unseen looks would take megabytes."""
+
 HOLD = 4
 """Frames for which the last instant of an episode stays, framed in green or red."""
 
@@ -115,7 +119,11 @@ def add_border(frames: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
 
 
 def write_video(
-  path: Path, frames: np.ndarray | Iterator[np.ndarray], *, fps: float
+  path: Path,
+  frames: np.ndarray | Iterator[np.ndarray],
+  *,
+  fps: float,
+  rate_factor: int = CRISP,
 ) -> Path:
   """Writes frames as MP4, or as GIF if the path ends in ".gif".
 
@@ -124,6 +132,7 @@ def write_video(
     frames: u8[T, H, W, 3], or an iterator over u8[H, W, 3], of which an MP4 holds one
       at a time in memory; padded with black to what the codec needs.
     fps: Frames per second of playback.
+    rate_factor: Quality of an MP4, from 0 (lossless) to 51.
 
   Returns:
     The path that was written.
@@ -142,17 +151,18 @@ def write_video(
     return path
   path = path.with_suffix(".mp4")
   with replacing(path) as part:
-    _encode(part, frames, fps=fps)
+    _encode(part, frames, fps, rate_factor)
   return path
 
 
-def _encode(path: Path, frames: Iterable[np.ndarray], *, fps: float) -> None:
+def _encode(
+  path: Path, frames: Iterable[np.ndarray], fps: float, rate_factor: int
+) -> None:
   # imageio's PyAV plugin cannot set the rate factor.
   with av.open(str(path), "w", format="mp4") as file:
     stream = file.add_stream("libx264", Fraction(fps).limit_denominator(1000))
     stream.pix_fmt = "yuv420p"
-    # Flat colors and hard edges need a rate factor below the default of 23.
-    stream.options = {"crf": "10"}
+    stream.options = {"crf": str(rate_factor)}
     for number, frame in enumerate(frames):
       _check(frame[None])
       padding = [(0, -side % _MACROBLOCK) for side in frame.shape[:2]]

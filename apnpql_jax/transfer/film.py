@@ -16,6 +16,7 @@ from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.training.video import (
   GREEN,
   HOLD,
+  NOISY,
   RED,
   add_border,
   tile,
@@ -48,9 +49,8 @@ def record(
     if number is not None
   ]
   path.parent.mkdir(parents=True, exist_ok=True)
-  written = write_video(
-    path, np.concatenate(clips), fps=1 / env.config.control_period_s
-  )
+  fps, frames = 1 / env.config.control_period_s, np.concatenate(clips)
+  written = write_video(path, frames, fps=fps, rate_factor=NOISY)
   numbers = {"success": chosen[True], "failure": chosen[False]}
   return {"video": str(written), "video_episodes": numbers}
 

@@ -13,7 +13,7 @@ import pytest
 
 from apnpql_jax.cli.main import main
 from apnpql_jax.deploy.export import VERSION
-from apnpql_jax.errors import ConfigError, FileError
+from apnpql_jax.errors import ConfigError, DeviceError, FileError
 from apnpql_jax.robot import cell, devices, policy_folder
 from apnpql_jax.robot.limits import MotionLimiter
 from apnpql_jax.testing import ROOT, export_untrained
@@ -207,12 +207,23 @@ def test_another_scene_is_refused_on_each_robot(
   assert f"was trained in another scene of {task}" in shown and shown.count("\n") == 1
 
 
-def test_a_missing_package_names_the_extra():
-  with pytest.raises(ConfigError) as error, devices.needing_packages():
-    raise ModuleNotFoundError("No module named 'rtde_receive'", name="rtde_receive")
-  assert str(error.value) == "robot needs ur_rtde: pip install 'apnpql-jax[robot]'"
-  with pytest.raises(ModuleNotFoundError), devices.needing_packages():
-    raise ModuleNotFoundError("No module named 'else'", name="else")
+@pytest.mark.parametrize(
+  ("kind", "module", "package"),
+  [
+    ("ur5e", "rtde_receive", "ur_rtde"),
+    ("double", "pyrealsense2", "pyrealsense2"),
+  ],
+)
+def test_a_missing_package_names_the_extra(
+  exported, monkeypatch, kind, module, package
+):
+  monkeypatch.setitem(sys.modules, module, None)
+  contract = policy_folder.load(exported).contract
+  robot = devices.Robot(kind, contract, cell.Cell())
+  opened = devices.open_arm if kind == "ur5e" else devices.open_cameras
+  with pytest.raises(DeviceError) as error, opened(robot):
+    pass
+  assert str(error.value) == f"robot needs {package}: pip install 'apnpql-jax[robot]'"
 
 
 def test_a_real_arm_does_not_move_unasked(exported, real_cell, capsys, monkeypatch):

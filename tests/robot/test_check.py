@@ -157,6 +157,10 @@ def joint_outside(bench: Bench) -> None:
   bench.arm.position = np.full(6, 6.28)
 
 
+def a_turn_away(bench: Bench) -> None:
+  bench.arm.position = bench.policy.neutral + 2 * np.pi * np.eye(6)[0]
+
+
 def stale_frames(bench: Bench) -> None:
   bench.cameras[1].age = 0.15
 
@@ -199,6 +203,7 @@ def broken(bench: Bench) -> None:
     (protective_stop, "arm", "FAILS: protective stop"),
     (tool_outside, "tool", "is outside the workspace box: move the arm by hand"),
     (joint_outside, "tool", "is outside its range"),
+    (a_turn_away, "tool", "is outside the workspace box: first move the arm by hand"),
     (stale_frames, "camera wrist", "when it acts, the limit is 100 ms"),
     (no_frames, "cameras", "FAILS: camera 12: sent no frame for 1.0 s"),
     (small_images, "cameras", "camera global: an image of (7, 9, 3), not 72 x 96"),

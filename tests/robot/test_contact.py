@@ -8,7 +8,7 @@ import pytest
 from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.contact import FILTER_S, stiffness_limit
 from apnpql_jax.robot.limits import TIMESTEP
-from apnpql_jax.robot.sensor import FREE_FORCE
+from apnpql_jax.robot.sensor import FREE_FORCE, load
 from apnpql_jax.robot.virtual_arm import Admittance, VirtualArm, ramp
 from apnpql_jax.sim.motors import VELOCITY_GAIN
 
@@ -20,30 +20,41 @@ KICK = 0.05  # N, of the disturbance
 NEAR = 0.1  # Relative distance from the predicted limit that the sweep leaves out.
 
 
+def wrench_at_tool(way: np.ndarray) -> np.ndarray:
+  """Returns the wrench f64[6] of 1 N on the tool along a direction of the world."""
+  flange, _ = MODEL.flange_pose(NEUTRAL)
+  torque = np.cross(MODEL.tool_position(NEUTRAL) - flange, way)
+  return np.concatenate([MODEL.base_mat.T @ way, MODEL.base_mat.T @ torque])
+
+
 def swing(
-  stiffness: float, lag: float, admittance: Admittance, seconds: float, share: float
+  stiffness: float,
+  lag: float,
+  admittance: Admittance,
+  seconds: float,
+  share: float,
+  way: np.ndarray,
 ) -> float:
   """Returns the swing of the force (N) at the end, after a small disturbance.
 
-  A linear wall pushes the tool up, and the policy presses just so much that it rests
-  where the damping has its ``share``.
+  A linear wall pushes the tool along ``way``, and the policy presses just so much that
+  it rests where the damping has its ``share``.
   """
   arm = VirtualArm(MODEL, admittance=admittance)
   arm.reset(NEUTRAL)
-  rest = FREE_FORCE * (1 + share)
-  arm._wrench[:3] = rest * UP  # As after a long time of contact.
+  unit = wrench_at_tool(way)
+  rest = (1 + share) / load(unit)
+  arm._wrench = rest * unit  # As after a long time of contact.
   felt = rest * ramp(1 + share)[1]
-  desired = -np.linalg.solve(STILL.mass, STILL.tool[:3].T @ UP) * felt / VELOCITY_GAIN
+  desired = -np.linalg.solve(STILL.mass, STILL.tool[:3].T @ way) * felt / VELOCITY_GAIN
   assert np.abs(VELOCITY_GAIN * desired).max() < 1.2
-  height = MODEL.tool_position(NEUTRAL)[2]
-  heights = [height] * (1 + round(lag / TIMESTEP))
-  forces, wrench = [], np.zeros(6)
+  place = MODEL.tool_position(NEUTRAL)
+  moved, forces = [0.0] * (1 + round(lag / TIMESTEP)), []
   for cycle in range(round(seconds / TIMESTEP)):
     kick = KICK if cycle < 5 else 0.0
-    wrench[2] = rest + kick - stiffness * (heights[0] - height)
-    forces.append(wrench[2])
-    advance(arm, desired, wrench)
-    heights = [*heights[1:], MODEL.tool_position(arm.position)[2]]
+    forces.append(rest + kick - stiffness * moved[0])
+    advance(arm, desired, forces[-1] * unit)
+    moved = [*moved[1:], (MODEL.tool_position(arm.position) - place) @ way]
   return np.ptp(forces[-round(0.5 / TIMESTEP) :])
 
 
@@ -55,14 +66,18 @@ def advance(arm: VirtualArm, desired: np.ndarray, wrench: np.ndarray) -> None:
 
 
 def check(
-  stiffness: float, lag: float, admittance: Admittance, share: float
+  stiffness: float,
+  lag: float,
+  admittance: Admittance,
+  share: float,
+  way: np.ndarray = UP,
 ) -> bool | None:
   """Compares motion and prediction; returns which, or None near the limit."""
-  limit = stiffness_limit(STILL, UP, admittance, lag, share=share)
+  limit = stiffness_limit(STILL, way, admittance, lag, share=share)
   if abs(stiffness / limit - 1) < NEAR:
     return None
   stable = bool(stiffness < limit)
-  found = swing(stiffness, lag, admittance, 4.0, share)
+  found = swing(stiffness, lag, admittance, 4.0, share, way)
   assert (found < KICK) == stable, (stiffness, lag, share, found, limit)
   return stable
 
@@ -79,6 +94,17 @@ def test_contacts_at_the_edge_of_the_dead_zone_are_stable_where_predicted(share)
     check(k, lag, Admittance(), share) for k in (1e4, 5e4) for lag in (0.03, 0.06)
   ]
   assert True in outcomes and (False in outcomes or share < 0.1)
+
+
+@pytest.mark.parametrize("way", [[1.0, 0.0, 0.0], [0.0, 0.6, 0.8]])
+def test_contacts_whose_torque_counts_are_stable_where_predicted(way):
+  """Forces across the hand: their torque on the flange is the first to be felt."""
+  outcomes = [
+    check(k, lag, Admittance(), 0.4, np.array(way))
+    for k in (1e4, 5e4)
+    for lag in (0.01, 0.06)
+  ]
+  assert True in outcomes and False in outcomes
 
 
 @pytest.mark.slow
@@ -118,10 +144,8 @@ def test_without_damping_a_soft_wall_is_unstable():
   assert check(1e4, 0.03, soft, 0.7) is False
 
 
-@pytest.mark.parametrize("lag", [0.01, 0.035])
-@pytest.mark.parametrize("stiffness", [1e3, 1e4])
-def test_a_hit_on_a_wall_of_the_designed_stiffness_comes_to_rest(stiffness, lag):
-  """The tool comes down at 0.1 m/s, may bounce, and then presses without buzzing."""
+def hit(stiffness: float, lag: float) -> list[float]:
+  """Returns the forces (N) as the tool comes down on a wall at 0.1 m/s, and stays."""
   arm = VirtualArm(MODEL, admittance=Admittance())
   arm.reset(NEUTRAL)
   wall = MODEL.tool_position(NEUTRAL)[2] - 0.02
@@ -131,6 +155,20 @@ def test_a_hit_on_a_wall_of_the_designed_stiffness_comes_to_rest(stiffness, lag)
     forces.append(max(0.0, stiffness * (wall - heights[0])))
     advance(arm, desired, np.append(forces[-1] * UP, np.zeros(3)))
     heights = [*heights[1:], MODEL.tool_position(arm.position)[2]]
+  return forces
+
+
+@pytest.mark.parametrize("lag", [0.01, 0.035])
+@pytest.mark.parametrize("stiffness", [1e3, 1e4])
+def test_a_hit_on_a_wall_of_the_designed_stiffness_comes_to_rest(stiffness, lag):
+  """It may bounce, and then presses without buzzing."""
+  forces = hit(stiffness, lag)
   assert max(forces) > 2 * FREE_FORCE or stiffness < 2e3  # It has felt all of it.
   assert np.ptp(forces[-round(0.5 / TIMESTEP) :]) < 0.2
   assert FREE_FORCE < forces[-1] < 3 * FREE_FORCE
+
+
+def test_a_hit_on_a_stiffer_wall_may_go_on_bouncing():
+  """The analysis is linear, with a wall that also pulls."""
+  forces = hit(1.5e4, 0.035)
+  assert np.ptp(forces[-round(0.5 / TIMESTEP) :]) > FREE_FORCE

@@ -171,6 +171,19 @@ def test_the_command_stays_near_an_arm_that_moves_as_it_likes():
   assert max(changes) > 2 * NARROW["none"].acceleration
 
 
+def test_an_arm_that_jumps_is_followed_at_the_speed_limit():
+  limiter = started(NARROW["none"])
+  watch, rng, used = Watch(limiter), np.random.default_rng(0), []
+  for cycle in range(600):
+    if cycle % 100 == 0:
+      arm = limiter.position + rng.uniform(-0.2, 0.2, 6)
+    limiter.step(np.zeros(6), arm)
+    watch.check(limiter.limits.acceleration, dragged=True)
+    used.append(watch.used["velocity"])
+  assert np.abs(limiter.position - arm).max() <= limiter.limits.deviation + TINY
+  assert used[0] == pytest.approx(1.0)
+
+
 @pytest.mark.parametrize("name", NARROW)
 def test_braking_ends_within_a_quarter_of_a_second_inside_the_boxes(name):
   used: dict[str, float] = {}

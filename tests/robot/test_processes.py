@@ -18,10 +18,9 @@ import time
 from typing import Any
 
 import numpy as np
-import pytest
 
-from apnpql_jax.robot import control_process, simulated
-from apnpql_jax.robot.board import Board, Phase, Record
+from apnpql_jax.robot import control_process, simulated, simulation
+from apnpql_jax.robot.board import Board, Phase, text
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
 from apnpql_jax.robot.devices import Robot
@@ -31,7 +30,10 @@ NEUTRAL = np.array([-1.8957, -1.7712, 1.9888, -1.7884, -1.5708, -0.3249])
 CONTRACT: dict[str, Any] = {
   "task": "push_plate",
   "control_period_s": 0.15,
-  "joints": {"ranges": [[-6.28, 6.28]] * 7},
+  "joints": {
+    "ranges": [[-6.28, 6.28]] * 7,
+    "gripper": {"open_rad": 0.0, "closed_rad": 1.1},
+  },
 }
 CLOCK = Clock(10.0)
 PARENT_KILLED = """
@@ -93,17 +95,19 @@ class Rig:
 
 
 @contextlib.contextmanager
-def rig() -> Generator[tuple[Board, Rig]]:
-  """Starts a plant, a control process and the policy of this module."""
+def rig(
+  target: Callable[[str, Any, Clock], None] = policy, contract: dict = CONTRACT
+) -> Generator[tuple[Board, Rig]]:
+  """Starts a plant, a control process, and as the policy a function of this module."""
   context = get_context("spawn")
-  robot = Robot("simulated", CONTRACT, Cell(), CLOCK)
+  robot = Robot("simulated", contract, Cell(), CLOCK)
   with simulated.started(robot) as robot, Board() as board:
     receiver, sender = context.Pipe(duplex=False)
     one, other = context.Pipe()
     args = robot, board.name, {"admittance": True}, sender, one
     processes = [
       context.Process(target=control, args=args),
-      context.Process(target=policy, args=(board.name, other, CLOCK)),
+      context.Process(target=target, args=(board.name, other, CLOCK)),
     ]
     for process in processes:
       process.start()
@@ -145,7 +149,7 @@ def start_motion(board: Board) -> None:
       until(lambda n=number: is_fast(board) or is_done(board, n + 1))
       if is_fast(board):
         return
-    reasons.append(board["state"].read()["reason"].decode())
+    reasons.append(text(board["state"].read()["reason"]))
   raise AssertionError(f"the arm stopped: {reasons}")
 
 
@@ -164,7 +168,7 @@ def speed(plant: Board) -> float:
 
 
 def test_a_killed_policy_brings_the_arm_to_rest_and_control_has_no_jax():
-  with rig() as (board, run), Board(run.plant, simulated.RECORDS) as plant:
+  with rig() as (board, run), Board(run.plant, simulation.RECORDS) as plant:
     start_motion(board)
     run.policy.kill()
     assert until(lambda: speed(plant) < 0.01) < 0.5
@@ -178,7 +182,7 @@ def test_a_killed_policy_brings_the_arm_to_rest_and_control_has_no_jax():
 
 
 def test_a_killed_control_process_ends_the_policy_and_the_arm_keeps_its_place():
-  with rig() as (board, run), Board(run.plant, simulated.RECORDS) as plant:
+  with rig() as (board, run), Board(run.plant, simulation.RECORDS) as plant:
     start_motion(board)
     run.control.kill()
     until(lambda: not run.policy.is_alive())
@@ -211,47 +215,10 @@ def test_a_simulated_arm_can_be_put_back_where_it_began():
   robot = Robot("simulated", CONTRACT, Cell(), CLOCK)
   with simulated.started(robot) as robot, simulated.opened(robot) as plant:
     begin = plant["plant"].read()["position"]
-    np.testing.assert_allclose(begin, NEUTRAL + simulated.PARKED, atol=1e-3)
+    np.testing.assert_allclose(begin, NEUTRAL + simulation.PARKED, atol=1e-3)
     plant["servo"].write({"follow": 1, "target": NEUTRAL})
     until(lambda: np.abs(plant["plant"].read()["position"] - NEUTRAL).max() < 0.02)
     plant["servo"].write({"follow": 0})
     plant["scene"].write({"parked": 1})
     until(lambda: plant["plant"].read()["parked"] == 1)
     np.testing.assert_allclose(plant["plant"].read()["position"], begin, atol=1e-3)
-
-
-def test_a_reader_never_sees_half_a_record():
-  """A writer in another process, as fast as it can."""
-  with Board(records=FLOOD) as board:
-    process = get_context("spawn").Process(target=flood, args=(board.name,))
-    process.start()
-    until(lambda: board["block"].read()["number"] > 0)
-    numbers = []
-    for _ in range(3000):
-      found = board["block"].read()
-      assert (found["values"] == found["number"]).all()
-      numbers.append(int(found["number"]))
-    process.kill()
-    process.join()
-    assert numbers == sorted(numbers) and numbers[-1] > numbers[0]
-
-
-FLOOD = {"block": [("number", "i8"), ("values", "i8", 500)]}
-
-
-def flood(name: str) -> None:
-  board, number = Board(name, FLOOD), 0
-  while True:
-    number += 1
-    board["block"].write({"number": number, "values": number})
-
-
-def test_a_record_that_stays_half_written_is_an_error():
-  fields = [("number", "i8")]
-  buffer = bytearray(Record.size(fields))
-  record = Record(memoryview(buffer), fields)
-  record.write({"number": 7})
-  assert Record(memoryview(buffer), fields).read()["number"] == 7
-  buffer[0] += 1
-  with pytest.raises(Exception, match="half-written"):
-    Record(memoryview(buffer), fields).read()

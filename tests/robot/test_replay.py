@@ -36,6 +36,8 @@ STATE = {
   "gripper": 0.5,
   "command": np.array(NEUTRAL),
   "wrench": np.zeros(6),
+  "time": 0.0,
+  "gripper_time": 0.0,
 }
 
 
@@ -52,11 +54,11 @@ def changed(*keys: str, value: Any) -> dict[str, Any]:
 def log(folder: Path, *episodes: np.ndarray, contract: Any = CONTRACT) -> Path:
   """Records episodes, as a run does."""
   frames = [Frame(0.0, np.zeros((16, 16, 3), np.uint8))] * 2
-  with recorder.Recorder(folder, contract) as writer:
+  with recorder.Recorder(folder, contract, judged=False) as writer:
     for actions in episodes:
       for action in actions:
-        writer.add(STATE, action, frames)
-      writer.end_episode(False)
+        writer.add(0.0, 0.0, STATE, action, frames)
+      writer.end_episode(None)
   return folder
 
 
@@ -121,7 +123,7 @@ def test_a_dataset_without_a_contract_is_refused(tmp_path, about):
 
 
 def test_a_log_without_episodes_is_refused(tmp_path):
-  with recorder.Recorder(tmp_path / "log", CONTRACT):
+  with recorder.Recorder(tmp_path / "log", CONTRACT, judged=False):
     pass
   with pytest.raises(FileError, match="has no episodes"):
     replay.recorded_actions(tmp_path / "log", CONTRACT)

@@ -12,8 +12,9 @@ from apnpql_jax.config.files import mjcf_path
 from apnpql_jax.robot.board import Board, Phase
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
-from apnpql_jax.robot.control_process import Controller
+from apnpql_jax.robot.control import Control
 from apnpql_jax.robot.core import Core
+from apnpql_jax.robot.hand import Hand
 from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.plant import Plant
 from apnpql_jax.robot.protocols import ArmState, GripperState
@@ -70,6 +71,8 @@ class PlantGripper(Device):
 
   def send_action(self, close: bool) -> None: ...
 
+  def hold(self) -> None: ...
+
 
 class Rig:
   """The controller of the runtime in lockstep with a plant."""
@@ -81,9 +84,8 @@ class Rig:
     self.hand = model.body("gripper").id
     self.arm = PlantArm(self.plant)
     core = Core(Cell().limits(CONTRACT))
-    self.control = Controller(
-      self.arm, PlantGripper(self.plant), core, board, clock=Turned()
-    )
+    hand = Hand(PlantGripper(self.plant), open_rad=0.0, closed_rad=1.1)
+    self.control = Control(self.arm, hand, core, board, clock=Turned())
     self.number = 0
 
   def press(self, force: np.ndarray | float) -> None:

@@ -142,3 +142,16 @@ def test_arrays_that_are_not_videos_are_rejected(tmp_path, frames):
 def test_views_of_unequal_length_are_rejected():
   with pytest.raises(ValueError, match=r"length: \[2, 3\]"):
     video.tile([_frames(2, 24, 24), _frames(3, 24, 24)])
+
+
+def test_noise_takes_less_at_its_rate_factor(tmp_path: Path):
+  noise = np.random.default_rng(0).normal(128, 10, (8, 64, 96, 3))
+  sizes = [
+    video.write_video(
+      tmp_path / f"{factor}.mp4", noise.astype(np.uint8), fps=5, rate_factor=factor
+    )
+    .stat()
+    .st_size
+    for factor in (video.CRISP, video.NOISY)
+  ]
+  assert sizes[1] < 0.3 * sizes[0]

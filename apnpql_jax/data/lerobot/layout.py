@@ -66,6 +66,8 @@ def features(
   vectors: Mapping[str, Sequence[str]],
   images: Mapping[str, tuple[int, int]],
   fps: float,
+  *,
+  judged: bool = True,
 ) -> dict[str, Json]:
   """Returns the features of ``info.json``.
 
@@ -73,6 +75,7 @@ def features(
     vectors: Column -> names of its numbers.
     images: Column -> height and width.
     fps: Frames per second.
+    judged: Whether it is known if the task was done.
   """
   found: dict[str, Json] = {
     name: {"dtype": "float32", "shape": [len(names)], "names": list(names)}
@@ -94,7 +97,8 @@ def features(
         "has_audio": False,
       },
     }
-  found[SUCCESS] = {"dtype": "bool", "shape": [1], "names": None}
+  if judged:
+    found[SUCCESS] = {"dtype": "bool", "shape": [1], "names": None}
   for name, kind in COUNTERS.items():
     found[name] = {"dtype": kind, "shape": [1], "names": None}
   return found

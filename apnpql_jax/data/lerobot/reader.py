@@ -30,8 +30,8 @@ class Episode:
   columns: Mapping[str, np.ndarray]
   """Columns of numbers f64[n, k], by name."""
 
-  success: bool
-  """Whether the task was done at the last frame."""
+  success: bool | None
+  """Whether the task was done at the last frame; None if the dataset has no label."""
 
   videos: Mapping[str, tuple[Path, float]]
   """Column of images -> its file, and the time at which the episode begins there."""
@@ -177,7 +177,8 @@ def _episode(
       f"not {row['length']}"
     )
   task = tasks[int(columns.pop("task_index")[0, 0])]
-  success = SUCCESS in data.column_names and _numbers(data[SUCCESS], mine)[-1, 0]
+  labeled = SUCCESS in data.column_names
+  success = bool(_numbers(data[SUCCESS], mine)[-1, 0]) if labeled else None
   videos = {}
   for key, about in info["features"].items():
     if about["dtype"] == "video":
@@ -188,7 +189,7 @@ def _episode(
       )
       videos[key] = folder / path, float(row[f"videos/{key}/from_timestamp"])
   time = np.arange(count) / dataset.fps
-  return Episode(task, time, columns, bool(success), videos)
+  return Episode(task, time, columns, success, videos)
 
 
 def _table(path: Path) -> Any:

@@ -37,6 +37,7 @@ class Writer:
     images: Mapping[str, tuple[int, int]] | None = None,
     robot_type: str,
     about: Json | None = None,
+    judged: bool = True,
   ):
     """Makes the folder and writes an empty dataset.
 
@@ -47,6 +48,8 @@ class Writer:
       images: Column of images -> height and width, such as "observation.images.wrist".
       robot_type: Name of the robot.
       about: Anything else to record, such as devices, as JSON.
+      judged: Whether each episode is given a success. The dataset has no "next.success"
+        otherwise, because a learner would take a value of it for the truth.
 
     Raises:
       ConfigError: pyarrow is missing.
@@ -57,7 +60,10 @@ class Writer:
     self._fps, self._robot_type = float(fps), robot_type
     self._vectors = {name: list(names) for name, names in vectors.items()}
     self._images = dict(images or {})
-    self._features = layout.features(self._vectors, self._images, self._fps)
+    self._judged = judged
+    self._features = layout.features(
+      self._vectors, self._images, self._fps, judged=judged
+    )
     self._tasks: list[str] = []
     self._stats: dict[str, Stats] = {}
     self._episodes = self._frames = 0
@@ -113,19 +119,22 @@ class Writer:
     for name, row in rows.items():
       self._rows.setdefault(name, []).append(row)
 
-  def end_episode(self, task: str, success: bool) -> None:
+  def end_episode(self, task: str, success: bool | None = None) -> None:
     """Writes the episode.
 
     Args:
       task: What the robot was to do, in words.
-      success: Whether it was done at the last frame.
+      success: Whether it was done at the last frame; None if nobody has judged it.
 
     Raises:
       FileError: It cannot be written.
-      ValueError: It has no frames.
+      ValueError: It has no frames, or a success in a dataset without, or none in one
+        with successes.
     """
     if not self._rows:
       raise ValueError("an episode needs a frame")
+    if (success is not None) != self._judged:
+      raise ValueError(f"success is {success} in a dataset with judged={self._judged}")
     if task not in self._tasks:
       self._tasks.append(task)
     columns = self._columns(task, success)
@@ -181,7 +190,7 @@ class Writer:
     """Ends the dataset; frames since the last episode are lost."""
     self.discard_episode()
 
-  def _columns(self, task: str, success: bool) -> dict[str, np.ndarray]:
+  def _columns(self, task: str, success: bool | None) -> dict[str, np.ndarray]:
     """Returns the columns of the episode, [n, k] each."""
     columns = {name: np.stack(rows) for name, rows in self._rows.items()}
     count = len(next(iter(columns.values())))
@@ -193,7 +202,8 @@ class Writer:
       "index": self._frames + numbers,
       "task_index": np.full(count, self._tasks.index(task)),
     }
-    columns[SUCCESS] = ((numbers == count - 1) & success)[:, None]
+    if success is not None:
+      columns[SUCCESS] = ((numbers == count - 1) & success)[:, None]
     for name, kind in COUNTERS.items():
       columns[name] = counters[name].astype(kind)[:, None]
     return columns

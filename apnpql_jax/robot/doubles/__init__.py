@@ -121,7 +121,7 @@ def serve(
   """
   settings = {
     "scene": task,
-    "host": _address(),
+    "host": address(os.getpid(), next(_COUNT)),
     "noise": noise,
     "gripper": gripper,
     "model_number": model_number,
@@ -131,7 +131,9 @@ def serve(
   return Child("apnpql_jax.robot.doubles.server", settings)
 
 
-def _address() -> str:
-  """Returns a loopback address of this process's own, as the ports are fixed."""
-  process, count = os.getpid(), next(_COUNT)
+def address(process: int, count: int) -> str:
+  """Returns the loopback address of the doubles that a process starts, from 0 on.
+
+  Each has its own, as the ports are fixed.
+  """
   return f"127.{process // 250 % 250 + 1}.{process % 250 + 1}.{count % 250 + 1}"

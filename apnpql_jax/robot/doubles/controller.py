@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from apnpql_jax.robot.doubles.plant import JOINTS, STEP, Plant
+from apnpql_jax.robot.doubles.plant import JOINTS, World
+from apnpql_jax.robot.limits import TIMESTEP
 
 VERSION = (5, 25, 1, 130182)
 SERIAL = "20265500000"
@@ -43,7 +44,7 @@ class Controller:
 
   def __init__(
     self,
-    plant: Plant,
+    plant: World,
     *,
     model: str = "UR5",
     remote: bool = True,
@@ -100,7 +101,7 @@ class Controller:
     return {
       **_STANDARD,
       "timestamp": time.monotonic() - self._boot,
-      "actual_execution_time": STEP,
+      "actual_execution_time": TIMESTEP,
       "target_speed_fraction": self._slider,
       "actual_q": plant.position.tolist(),
       "actual_qd": plant.velocity.tolist(),

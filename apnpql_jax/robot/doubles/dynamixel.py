@@ -11,8 +11,9 @@ import math
 import os
 import tty
 
-from apnpql_jax.robot.doubles.plant import STEP, Plant
+from apnpql_jax.robot.doubles.plant import World
 from apnpql_jax.robot.drivers.rh_p12_rn import TICK, Field, Table, torque
+from apnpql_jax.robot.limits import TIMESTEP
 
 FIRMWARE = 11
 DEVICE_ID = 1
@@ -35,7 +36,7 @@ _ACCELERATION = {"RH-P12-RN": 214.577, "RH-P12-RN(A)": 1.0}  # rev/min^2 per uni
 class Gripper:
   """The registers, and what they make the plant's fingers do."""
 
-  def __init__(self, table: Table, plant: Plant, model_number: int | None = None):
+  def __init__(self, table: Table, plant: World, model_number: int | None = None):
     """Starts with the torque off; another model number is for tests."""
     self.table, self._plant = table, plant
     self._memory = bytearray(1024)
@@ -66,7 +67,7 @@ class Gripper:
     limit = self._get(table.velocity) or self._get(table.velocity_limit)
     rate = self._get(table.acceleration) * _ACCELERATION[table.name] * _REVOLUTION / 60
     limit = limit * table.rpm * _REVOLUTION
-    faster = self._speed + rate * STEP if rate else limit
+    faster = self._speed + rate * TIMESTEP if rate else limit
     self._speed = min(limit, faster) if abs(goal - plant.finger) > TICK else 0.0
     share = self._get(table.goal_current) / table.largest_current
     plant.grip(goal, self._speed, torque(share))

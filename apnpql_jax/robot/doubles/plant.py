@@ -16,8 +16,8 @@ import mujoco
 import numpy as np
 
 from apnpql_jax.config import files
+from apnpql_jax.robot.limits import TIMESTEP
 
-STEP = 0.002  # s, the control cycle of an e-Series controller
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 FINGER = "finger_r1"
 SPEED_LIMIT = math.pi  # rad/s, the UR5e's joints, data sheet
@@ -29,7 +29,7 @@ NOISE = np.array([0.3, 0.3, 0.3, 0.01, 0.01, 0.01])  # N, N m: standard deviatio
 REFERENCE_GAIN = 300.0
 
 
-class Plant:
+class World:
   """One world of a task's scene."""
 
   def __init__(self, scene: str, *, noise: bool = True):
@@ -39,7 +39,7 @@ class Plant:
       ConfigError: There is no such scene.
     """
     self.model = model = compile_scene(scene)
-    model.opt.timestep = STEP
+    model.opt.timestep = TIMESTEP
     self.data = data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("neutral").id)
     joints = [model.joint(name) for name in JOINTS]
@@ -54,7 +54,7 @@ class Plant:
     self._flange, self._base = data.site("attachment_site"), data.site("base_frame")
     self._mass = np.zeros((model.nv, model.nv))
     self._block = np.ix_(self._dofs, self._dofs)
-    self._goal, self._lag = self.position, STEP
+    self._goal, self._lag = self.position, TIMESTEP
     self.lock()
     self._finger_goal, self._finger_speed, self._grip = self.finger, 0.0, 0.0
     self._rng = np.random.default_rng(0) if noise else None
@@ -120,7 +120,7 @@ class Plant:
     self._zero = self._measure() + self._zero
 
   def step(self) -> str:
-    """Advances by ``STEP``; returns why the controller would stop the arm, or ""."""
+    """Advances by 2 ms; returns why the controller would stop the arm, or ""."""
     self._smooth()
     model, data = self.model, self.data
     mujoco.mj_step1(model, data)
@@ -137,14 +137,14 @@ class Plant:
   def _smooth(self) -> None:
     """Moves the joint target of this cycle."""
     if self._braking:
-      speed, drop = np.abs(self._velocity).max(), self._braking * STEP
+      speed, drop = np.abs(self._velocity).max(), self._braking * TIMESTEP
       left = 0.0 if speed <= drop else 1 - drop / speed
       self._velocity = self._velocity * left
     else:
-      lag = max(self._lag, STEP)
+      lag = max(self._lag, TIMESTEP)
       wanted = (self._goal - self.target) / lag
       self._velocity = wanted.clip(-SPEED_LIMIT, SPEED_LIMIT)
-    self.target = self.target + self._velocity * STEP
+    self.target = self.target + self._velocity * TIMESTEP
 
   def _arm_torque(self) -> np.ndarray:
     """Computes the torque of a stiff servo with the arm's own dynamics, N m."""

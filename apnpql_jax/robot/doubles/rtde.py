@@ -53,7 +53,7 @@ def kind_of(name: str) -> str:
   return KINDS.get(name, "NOT_FOUND")
 
 
-class Session:
+class RtdeSession:
   """One client of the server: its recipes, and whether it receives outputs."""
 
   def __init__(self, version: tuple[int, int, int, int], write: Callable[..., None]):

@@ -20,9 +20,10 @@ from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot.doubles import modbus
 from apnpql_jax.robot.doubles.controller import VERSION, Controller
 from apnpql_jax.robot.doubles.dynamixel import Gripper, open_terminal
-from apnpql_jax.robot.doubles.plant import STEP, Plant
-from apnpql_jax.robot.doubles.rtde import Session
+from apnpql_jax.robot.doubles.plant import World
+from apnpql_jax.robot.doubles.rtde import RtdeSession
 from apnpql_jax.robot.drivers.rh_p12_rn import TABLES
+from apnpql_jax.robot.limits import TIMESTEP
 
 DASHBOARD, SCRIPT, RTDE = 29999, 30003, 30004  # ports of every UR controller
 REMOTE = 30099  # of ``ask``
@@ -42,7 +43,7 @@ class Server:
     """
     self._controller = controller
     self._selector = selectors.DefaultSelector()
-    self._sessions: dict[socket.socket, Session] = {}
+    self._sessions: dict[socket.socket, RtdeSession] = {}
     self._scripts: dict[socket.socket, bytes] = {}
     self._mute = False
     self._host = host
@@ -94,7 +95,7 @@ class Server:
       for act in each:
         act()
       self._publish()
-      due = max(due + STEP, time.monotonic() - _CATCH_UP * STEP)
+      due = max(due + TIMESTEP, time.monotonic() - _CATCH_UP * TIMESTEP)
 
   def _open(self, port: int, act: Callable[[socket.socket], None]) -> None:
     listener = socket.create_server((self._host, port))
@@ -127,7 +128,7 @@ class Server:
     self.watch(client, read)
 
   def _rtde(self, client: socket.socket) -> None:
-    session = Session(VERSION, self._controller.write)
+    session = RtdeSession(VERSION, self._controller.write)
     self._sessions[client] = session
 
     def read() -> None:
@@ -172,7 +173,7 @@ class Remote:
   """What other processes may ask for, by name; see ``ask``."""
 
   def __init__(
-    self, plant: Plant, controller: Controller, gripper: Gripper, server: Server
+    self, plant: World, controller: Controller, gripper: Gripper, server: Server
   ):
     """Keeps what it acts on."""
     self._plant, self._gripper, self._controller = plant, gripper, controller
@@ -231,7 +232,7 @@ def ask(host: str, name: str) -> Any:
 def main(pipe: Connection) -> None:
   """Runs arm and gripper with the settings of the parent, until that ends."""
   settings = pipe.recv()
-  plant = Plant(settings["scene"], noise=settings["noise"])
+  plant = World(settings["scene"], noise=settings["noise"])
   controller = Controller(plant, **settings["controller"])
   server = Server(settings["host"], controller)
   gripper = Gripper(

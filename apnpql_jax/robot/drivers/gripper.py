@@ -133,6 +133,16 @@ class RHP12RN:
     self._check()
     self._goal = CLOSED if close else OPEN
 
+  def hold(self) -> None:
+    """See ``protocols.Gripper``; nothing moves before the first command.
+
+    Raises:
+      DeviceError: The gripper has fallen silent, or reports an error.
+    """
+    self._check()
+    if self._goal is not None and self._state:
+      self._goal = min(max(round(self._state.angle / TICK), OPEN), CLOSED)
+
   def _check(self) -> None:
     if self._error:
       raise DeviceError(self._error)

@@ -22,7 +22,8 @@ import numpy as np
 from apnpql_jax.errors import DeviceError, one_line
 from apnpql_jax.robot.drivers import vendor
 from apnpql_jax.robot.drivers.ur_check import check_controller
-from apnpql_jax.robot.drivers.ur_state import CYCLE, VARIABLES, Reports
+from apnpql_jax.robot.drivers.ur_state import VARIABLES, Reports
+from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.protocols import ArmState
 
 LOOKAHEAD = 0.03  # s, the least that servoJ takes
@@ -57,7 +58,7 @@ class UR5e:
     """
     self._host = host
     self._payload = float(payload_kg), [float(x) for x in payload_cog_m]
-    self._servo = CYCLE, float(lookahead_s), float(gain)
+    self._servo = TIMESTEP, float(lookahead_s), float(gain)
     self._receive: Any = None
     self._reports: Reports | None = None
     self._control: Any = None
@@ -79,9 +80,11 @@ class UR5e:
     self._about = check_controller(self._host, dashboard)
     try:
       self._receive = self._within(
-        receive.RTDEReceiveInterface, self._host, 1 / CYCLE, VARIABLES
+        receive.RTDEReceiveInterface, self._host, 1 / TIMESTEP, VARIABLES
       )
-      self._control = self._within(control.RTDEControlInterface, self._host, 1 / CYCLE)
+      self._control = self._within(
+        control.RTDEControlInterface, self._host, 1 / TIMESTEP
+      )
       # Its destructor ends the process if the connection is lost: it never runs.
       ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._control))
       self._reports = Reports(self._host, self._receive)
@@ -107,7 +110,7 @@ class UR5e:
     """See ``protocols.Device``."""
     _, lookahead, gain = self._servo
     mass, center = self._payload
-    servo = {"cycle_s": CYCLE, "lookahead_s": lookahead, "gain": gain}
+    servo = {"cycle_s": TIMESTEP, "lookahead_s": lookahead, "gain": gain}
     return {
       **self._about,
       "payload_kg": mass,
@@ -187,7 +190,7 @@ class UR5e:
     while not self._control.isProgramRunning():
       if time.monotonic() > end:
         raise DeviceError(f"{self._host}: the program on the controller does not start")
-      time.sleep(CYCLE)
+      time.sleep(TIMESTEP)
 
   def _command(self, name: str, call: Callable[..., bool], *args: Any) -> None:
     if not self._within(call, *args):

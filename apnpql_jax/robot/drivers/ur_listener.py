@@ -8,7 +8,8 @@ from typing import Any
 from apnpql_jax.errors import DeviceError, one_line
 from apnpql_jax.robot.drivers import vendor
 from apnpql_jax.robot.drivers.ur_check import LOCAL, check_rtde, identify
-from apnpql_jax.robot.drivers.ur_state import CYCLE, VARIABLES, Reports
+from apnpql_jax.robot.drivers.ur_state import VARIABLES, Reports
+from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.protocols import ArmState
 
 
@@ -30,7 +31,7 @@ class Listener:
     receive = vendor("rtde_receive", "ur_rtde")
     check_rtde(self._host)
     try:
-      self._receive = receive.RTDEReceiveInterface(self._host, 1 / CYCLE, VARIABLES)
+      self._receive = receive.RTDEReceiveInterface(self._host, 1 / TIMESTEP, VARIABLES)
     except Exception as error:  # ur_rtde raises several kinds.
       raise DeviceError(f"{self._host}: {one_line(error)}") from None
     self._reports = Reports(self._host, self._receive)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from apnpql_jax.errors import DeviceError
+from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.protocols import ArmState
 
-CYCLE = 0.002  # s
 VARIABLES = [
   *("timestamp", "actual_q", "actual_qd", "actual_TCP_force", "robot_mode"),
   *("safety_status_bits", "robot_status_bits", "target_speed_fraction"),
@@ -41,7 +41,7 @@ class Reports:
   def __init__(self, host: str, source: Any):
     """Starts to follow the controller's clock; ``source`` is the vendor's client."""
     self._host, self._source = host, source
-    self._clock = Clock()
+    self._clock = ControllerClock()
 
   @property
   def connected(self) -> bool:
@@ -109,7 +109,7 @@ class Reports:
       self.check()
       if time.monotonic() > end:
         raise DeviceError(f"{self._host}: the arm does not come to rest")
-      time.sleep(CYCLE)
+      time.sleep(TIMESTEP)
 
   def wait_for_news(self) -> None:
     """Waits for a measurement of one of the next cycles.
@@ -118,12 +118,12 @@ class Reports:
       DeviceError: There is a fault.
     """
     now = time.monotonic()
-    while self._clock.local(self._source.getTimestamp()) < now + 2 * CYCLE:
+    while self._clock.local(self._source.getTimestamp()) < now + 2 * TIMESTEP:
       self.check()
-      time.sleep(CYCLE)
+      time.sleep(TIMESTEP)
 
 
-class Clock:
+class ControllerClock:
   """The controller's clock in terms of ``time.monotonic``.
 
   A packet cannot arrive before it was sent. So the smallest difference of both clocks

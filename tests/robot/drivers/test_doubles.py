@@ -14,9 +14,10 @@ import pytest
 
 from apnpql_jax.errors import ConfigError, DeviceError
 from apnpql_jax.robot import doubles
-from apnpql_jax.robot.doubles.plant import STEP, Plant
-from apnpql_jax.robot.doubles.rtde import Session
+from apnpql_jax.robot.doubles.plant import World
+from apnpql_jax.robot.doubles.rtde import RtdeSession
 from apnpql_jax.robot.doubles.server import ask
+from apnpql_jax.robot.limits import TIMESTEP
 
 PACKAGES = "rtde_control", "dynamixel_sdk", "pyrealsense2", "cv2"
 
@@ -70,7 +71,7 @@ def test_the_cameras_see_what_arm_and_gripper_do(rig):
   begin, start = time.monotonic(), rig.arm.get_observation().position
   while (now := time.monotonic()) < begin + 1:
     rig.arm.send_action(start + [0.3 * (now - begin), 0, 0, 0, 0, 0])
-    time.sleep(STEP)
+    time.sleep(TIMESTEP)
   rig.arm.stop()
   assert changed(overview, newest(rig, "global")) > 0.01
   wrist = newest(rig, "wrist")
@@ -136,7 +137,7 @@ server.close()
 
 
 def test_payload_of_the_rig_is_that_of_the_scene():
-  plant = Plant("push_plate", noise=False)
+  plant = World("push_plate", noise=False)
   tool = plant.model.body("gripper").id
   assert plant.model.body_subtreemass[tool] == pytest.approx(doubles.PAYLOAD_KG)
   plant.zero_wrench()
@@ -160,7 +161,7 @@ def test_drivers_and_doubles_import_no_jax():
 
 
 def test_the_fingers_lift_an_object():
-  plant = Plant("stack_box", noise=False)
+  plant = World("stack_box", noise=False)
   plant.zero_wrench()
   model, data = plant.model, plant.data
   box = model.joint(int(np.flatnonzero(model.jnt_type == 0)[0]))  # The first free body.
@@ -179,7 +180,7 @@ def test_the_fingers_lift_an_object():
   model.opt.gravity[:] = 0, 0, -9.81
   start, place = plant.position, data.qpos[address : address + 3] - tool.xpos
   for step in range(500):
-    plant.servo(start - [0, 0.2 * step * STEP, 0, 0, 0, 0], 0.03, 300)
+    plant.servo(start - [0, 0.2 * step * TIMESTEP, 0, 0, 0, 0], 0.03, 300)
     plant.step()
   held = data.qpos[address : address + 3] - tool.xpos
   assert np.linalg.norm(held) < 0.03 + np.linalg.norm(place)
@@ -187,9 +188,9 @@ def test_the_fingers_lift_an_object():
 
 
 def test_the_plant_follows_with_the_lag_of_servo_j():
-  plant = Plant("push_plate", noise=False)
+  plant = World("push_plate", noise=False)
   start, swing = plant.position, np.array([0.3, 0.1, -0.1, 0.2, -0.2, 0.3])
-  times = np.arange(0, 3, STEP)
+  times = np.arange(0, 3, TIMESTEP)
   targets = start + swing * np.sin(times[:, None]) ** 2
   for lookahead, gain, lag in ((0.03, 300, 0.03), (0.1, 300, 0.1), (0.03, 150, 0.06)):
     real = []
@@ -197,16 +198,16 @@ def test_the_plant_follows_with_the_lag_of_servo_j():
       plant.servo(target, lookahead, gain)
       assert not plant.step()
       real.append(plant.position)
-    delays = np.arange(0.0, 0.2, STEP)
+    delays = np.arange(0.0, 0.2, TIMESTEP)
     for joint in range(6):
       late = [np.interp(times - d, times, targets[:, joint]) for d in delays]
       errors = [np.abs(x - np.array(real)[:, joint])[500:].mean() for x in late]
       best = delays[int(np.argmin(errors))]
-      assert best == pytest.approx(lag, abs=3 * STEP)
+      assert best == pytest.approx(lag, abs=3 * TIMESTEP)
       assert min(errors) < 0.01 * abs(swing[joint])
 
 
 def test_other_bytes_than_rtde_are_refused():
-  session = Session((5, 25, 0, 0), lambda _: None)
+  session = RtdeSession((5, 25, 0, 0), lambda _: None)
   with pytest.raises(ValueError, match="not RTDE"):
     session.receive(b"GET / HTTP/1.1\r\n\r\n")

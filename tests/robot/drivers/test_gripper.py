@@ -123,6 +123,27 @@ def test_the_model_is_identified_and_opens_and_closes(number, bus):
       assert gripper.get_observation().angle == pytest.approx(truth, abs=2 * TICK)
 
 
+@pytest.mark.parametrize("close", [True, False])
+def test_fingers_on_their_way_are_held(close):
+  with bench() as (host, port), held(port) as gripper:
+    gripper.hold()  # Nothing to hold before the first command.
+    gripper.send_action(not close)
+    settle(gripper, 0.0 if close else 1.1)
+    gripper.send_action(close)
+    end = time.monotonic() + 6
+    while (gripper.get_observation().angle > 0.5) != close:
+      assert time.monotonic() < end
+      time.sleep(0.005)
+    gripper.hold()
+    time.sleep(0.3)
+    before = ask(host, "state")["finger"]
+    assert before == pytest.approx(0.5, abs=0.3)
+    time.sleep(0.5)
+    assert ask(host, "state")["finger"] == pytest.approx(before, abs=0.01)
+    gripper.send_action(close)
+    settle(gripper, 1.1 if close else 0.0)
+
+
 def test_the_gap_closes_at_the_speed_of_the_training():
   with bench() as (_, port), held(port) as gripper:
     gripper.send_action(False)

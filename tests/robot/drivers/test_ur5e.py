@@ -16,7 +16,7 @@ import pytest
 from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot import doubles
 from apnpql_jax.robot.drivers.ur5e import UR5e
-from apnpql_jax.robot.drivers.ur_state import CYCLE
+from apnpql_jax.robot.limits import TIMESTEP
 
 pytest.importorskip("rtde_control", reason="needs ur_rtde")
 
@@ -37,7 +37,7 @@ def servo(arm: UR5e, path: Callable[[float], np.ndarray], seconds: float) -> lis
     command = path(now - begin)
     arm.send_action(command)
     log.append((now, command, arm.get_observation()))
-    due = max(due + CYCLE, now)
+    due = max(due + TIMESTEP, now)
     time.sleep(max(0.0, due - time.monotonic()))
   return log
 
@@ -113,7 +113,7 @@ def test_start_keeps_the_zero_if_asked_to():
 def test_the_table_pushes_the_tool_up(rig):
   position, force = rig.arm.get_observation().position, 0.0
   for _ in range(6000):
-    position = position + np.array([0, 1, 0, -1, 0, 0]) * 0.15 * CYCLE
+    position = position + np.array([0, 1, 0, -1, 0, 0]) * 0.15 * TIMESTEP
     force = servo(rig.arm, lambda _: position, 0.0005)[-1][2].wrench[2]  # noqa: B023
     if force > 20:
       break

@@ -1,0 +1,314 @@
+"""The cycle of the control process on the simulated robot, in this process.
+
+A clock that the test turns makes it exact, and faster than time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import math
+
+import numpy as np
+import pytest
+
+from apnpql_jax.errors import DeviceError
+from apnpql_jax.robot import simulated
+from apnpql_jax.robot.board import PERIOD_BIN_S, Board, Phase, text
+from apnpql_jax.robot.cell import Cell
+from apnpql_jax.robot.clock import Clock
+from apnpql_jax.robot.control import GRIP_S, Control
+from apnpql_jax.robot.core import Core
+from apnpql_jax.robot.hand import THERE_RAD, Hand
+from apnpql_jax.robot.limits import TIMESTEP
+from apnpql_jax.robot.plant import Plant
+from apnpql_jax.robot.protocols import ArmState, GripperState
+from apnpql_jax.robot.simulation import RECORDS, Scene, Simulation
+from apnpql_jax.robot.supervisor import Mode
+from apnpql_jax.sim import motors
+from apnpql_jax.tasks import make_task
+
+CONTRACT = {
+  "control_period_s": 0.15,
+  "joints": {"ranges": [[-6.28, 6.28]] * 6 + [[0, 1.1]]},
+}
+NEUTRAL = np.array([-1.8957, -1.7712, 1.9888, -1.7884, -1.5708, -0.3249])
+STILL = np.zeros(6)
+NEVER = math.inf
+
+
+class TurnedClock(Clock):
+  """Stands until it is turned."""
+
+  time = 100.0
+
+  def now(self) -> float:
+    return TurnedClock.time
+
+
+class Arm(simulated.SimulatedArm):
+  """The simulated arm, whose cable may be pulled out."""
+
+  lost_at = NEVER
+
+  def start(self, *, zero: bool = True) -> None:
+    super().start(zero=zero)
+    TurnedClock.time += 0.01  # The real one waits.
+
+  def get_observation(self) -> ArmState:
+    found = super().get_observation()
+    if found.time < self.lost_at:
+      self._last = found
+    return self._last
+
+
+class Gripper(simulated.SimulatedGripper):
+  """The simulated gripper, whose cable may be pulled out, as its driver shows it."""
+
+  lost_at = NEVER
+  fails = False
+
+  def get_observation(self) -> GripperState:
+    found = super().get_observation()
+    if found.time >= self.lost_at and self.fails:
+      raise DeviceError("gripper: /dev/ttyUSB0: it does not answer")
+    if found.time < self.lost_at:
+      self._last = found
+    return self._last
+
+
+class Rig:
+  """Plant and control, in turns of 2 ms."""
+
+  def __init__(self, board: Board, plant_board: Board):
+    task = make_task("push_plate")
+    self.board, self.plant = board, Plant(task.scene.model)
+    self.simulation = Simulation(plant_board, self.plant, Scene(task, seed=0))
+    self.simulation.publish(TurnedClock.time)
+    self.arm, self.gripper = Arm(plant_board.name), Gripper(plant_board.name)
+    for device in (self.arm, self.gripper):
+      device.connect()
+    hand = Hand(self.gripper, open_rad=0.0, closed_rad=1.1)
+    core = Core(Cell().limits(CONTRACT))
+    self.control = Control(self.arm, hand, core, board, clock=TurnedClock())
+    self.number, self.actions = 0, 0
+    self.values: np.ndarray | None = None
+    """What the policy wants, or None for a policy that is silent."""
+
+  def order(self, phase: Phase, **fields) -> None:
+    self.number += 1
+    self.actions = 0
+    self.board["order"].write({"number": self.number, "phase": phase, **fields})
+
+  def go_home(self, closed: bool) -> None:
+    self.order(Phase.HOME, target=NEUTRAL, close=int(closed))
+
+  def play(self, *arm: float, close: bool) -> None:
+    self.values = np.array([*(arm or STILL), float(close)])
+    self.order(Phase.PLAY)
+
+  def turn(self, seconds: float = TIMESTEP) -> None:
+    """Runs the plant, then a cycle."""
+    for _ in range(round(seconds / TIMESTEP)):
+      TurnedClock.time += TIMESTEP
+      self.simulation.obey(self.now)
+      self.simulation.step()
+    self.simulation.publish(self.now)
+    if self.values is not None and self.control.phase is Phase.PLAY:
+      self.actions += 1
+      self.board["action"].write(
+        {
+          "order": self.number,
+          "number": self.actions,
+          "time": self.now,
+          "values": self.values,
+          "frames": np.full(2, self.now),
+        }
+      )
+    self.control.cycle()
+
+  def run(self, seconds: float) -> None:
+    for _ in range(round(seconds / TIMESTEP)):
+      self.turn()
+
+  def run_until_done(self, seconds: float = 20.0) -> None:
+    end = self.now + seconds
+    while not (self.state["done"] and self.state["number"] == self.number):
+      assert self.now < end
+      self.turn()
+
+  @property
+  def now(self) -> float:
+    return TurnedClock.time
+
+  @property
+  def state(self):
+    return self.board["state"].read()
+
+  @property
+  def reason(self) -> str:
+    return text(self.state["reason"])
+
+  @property
+  def finger(self) -> float:
+    return self.plant.gripper_angle
+
+  @property
+  def speed(self) -> float:
+    return float(np.abs(self.plant.arm_state(0.0).velocity).max())
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+  with Board() as board, Board(records=RECORDS) as plant_board:
+    made = Rig(board, plant_board)
+    yield made
+    made.arm.disconnect()
+    made.gripper.disconnect()
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_home_is_done_when_arm_and_gripper_are_there(rig, closed):
+  rig.go_home(closed)
+  rig.run_until_done()
+  assert rig.state["mode"] == Mode.FOLLOW and rig.reason == ""
+  assert np.abs(rig.state["position"] - NEUTRAL).max() < 0.01
+  assert abs(rig.finger - (1.1 if closed else 0.0)) < THERE_RAD
+
+
+def test_home_waits_for_a_gripper_that_is_slower_than_the_arm(rig):
+  rig.go_home(closed=True)
+  rig.run_until_done()
+  rig.go_home(closed=False)
+  begin = rig.now
+  rig.run(0.2)
+  assert not rig.state["done"] and rig.finger > THERE_RAD
+  rig.run_until_done()
+  assert rig.finger < THERE_RAD and rig.now - begin > 0.5
+
+
+def test_home_moves_no_finger_of_an_arm_that_must_not_move(rig):
+  rig.go_home(closed=True)
+  rig.run_until_done()
+  before = rig.finger
+  rig.plant.put_arm(NEUTRAL + [0, -1.0, -1.0, 0, 0, 0])  # High above the workspace.
+  rig.turn()
+  rig.go_home(closed=False)
+  rig.run_until_done()
+  assert "outside the workspace box" in rig.reason
+  rig.run(0.5)
+  assert rig.finger == pytest.approx(before, abs=0.01)
+
+
+def test_home_ends_with_a_gripper_that_does_not_get_there(rig, monkeypatch):
+  rig.go_home(closed=True)
+  rig.run_until_done()
+  monkeypatch.setattr(motors, "gripper_torque", lambda *_, **__: 0.0)  # No power.
+  rig.go_home(closed=False)
+  begin = rig.now
+  rig.run_until_done()
+  assert rig.reason == f"gripper: still at {rig.finger:.2f} rad after 3 s"
+  assert GRIP_S < rig.now - begin < GRIP_S + 0.5
+
+
+@pytest.mark.parametrize(("fails", "at_most"), [(False, 0.31), (True, 0.01)])
+def test_a_silent_gripper_stops_an_episode_in_time(rig, fails, at_most):
+  rig.go_home(closed=True)
+  rig.run_until_done()
+  rig.play(1.0, 0, 0, 0, 0, 0, close=True)
+  rig.run(0.5)
+  assert rig.state["mode"] == Mode.FOLLOW and rig.speed > 0.3
+  rig.gripper.fails, rig.gripper.lost_at = fails, rig.now
+  begin = rig.now
+  while rig.state["mode"] == Mode.FOLLOW:
+    rig.turn()
+    assert rig.now - begin < at_most
+  expected = "/dev/ttyUSB0: it does not answer" if fails else "measurement is 30"
+  assert rig.reason.startswith(f"gripper: {expected}")
+  rig.run(0.5)
+  assert rig.state["done"] and rig.speed < 0.01
+
+
+def test_an_arm_whose_connection_drops_stops(rig):
+  rig.go_home(closed=True)
+  rig.run_until_done()
+  rig.play(1.0, 0, 0, 0, 0, 0, close=True)
+  rig.run(0.5)
+  rig.arm.lost_at = rig.now
+  rig.run(0.03)
+  assert rig.state["mode"] == Mode.STOP
+  assert rig.reason.startswith("joints: measurement is 2")
+  rig.run(0.5)
+  assert rig.state["done"] and rig.speed < 0.01
+  assert not rig.control.at_rest  # Nobody can see it.
+
+
+def stopped_while(rig: Rig, close: bool, after: float) -> tuple[float, float]:
+  """Stops an episode some time after a command to the gripper.
+
+  Returns the finger's angles at the stop and a second later.
+  """
+  rig.go_home(closed=not close)
+  rig.run_until_done()
+  rig.play(close=close)
+  rig.run(after)
+  rig.control.end_motion("test")
+  rig.turn()
+  assert rig.state["mode"] == Mode.STOP
+  before = rig.finger
+  rig.run(1.0)
+  return before, rig.finger
+
+
+@pytest.mark.parametrize("close", [True, False])
+def test_fingers_that_move_stop_where_they_are(rig, close):
+  before, after = stopped_while(rig, close, after=0.4)
+  assert 0.1 < before < 1.0
+  assert after == pytest.approx(before, abs=0.02)
+
+
+def test_a_grip_stays_after_a_stop(rig):
+  """Closed fingers press on each other with all of their limited torque."""
+  stopped_while(rig, True, after=3.0)
+  torque = rig.plant.data.ctrl[6]
+  assert torque == pytest.approx(motors.GRIPPER_TORQUE, rel=0.1)
+  rig.go_home(closed=False)  # The next command is obeyed.
+  rig.run_until_done()
+  assert rig.finger < THERE_RAD
+
+
+def test_the_fingers_move_again_after_they_were_stopped(rig):
+  stopped_while(rig, True, after=0.4)
+  rig.go_home(closed=True)
+  rig.run_until_done()
+  assert abs(rig.finger - 1.1) < THERE_RAD
+
+
+def test_rest_is_what_the_joints_show(rig):
+  rig.go_home(closed=True)
+  rig.run_until_done()
+  rig.play(1.0, 0, 0, 0, 0, 0, close=True)
+  rig.run(0.5)
+  assert not rig.state["at_rest"]
+  rig.order(Phase.QUIT)
+  while rig.control.phase is not Phase.QUIT:
+    rig.turn()
+    assert not rig.state["at_rest"] or rig.control.phase is Phase.IDLE
+  rig.run(0.3)
+  assert rig.state["at_rest"] and rig.speed < 0.01
+
+
+def test_late_cycles_are_counted_but_not_waits_for_the_arm(rig):
+  rig.go_home(closed=True)
+  rig.run_until_done()
+  rig.play(close=True)
+  before = late(rig)
+  rig.run(0.1)
+  assert late(rig) == before
+  rig.turn(0.006)
+  rig.turn(0.002)
+  rig.turn(0.008)
+  assert late(rig) == before + 2
+
+
+def late(rig: Rig) -> int:
+  return int(rig.state["periods"][round(2 * TIMESTEP / PERIOD_BIN_S) :].sum())

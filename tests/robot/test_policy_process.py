@@ -1,0 +1,134 @@
+"""A fault of the policy process stops the arm at once, and its episode is in the log.
+
+The process is the real one. It repeats a log, so that it needs no JAX, and its cameras
+fail as those of a vendor do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+import contextlib
+import functools
+from multiprocessing import get_context
+from pathlib import Path
+import threading
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import pytest
+from test_processes import CLOCK, NEUTRAL, is_done, rig, speed, until
+
+from apnpql_jax.data import lerobot
+from apnpql_jax.errors import DeviceError
+from apnpql_jax.robot import devices, policy_folder, policy_process, simulation
+from apnpql_jax.robot.board import Board, Phase, text
+from apnpql_jax.robot.cell import Cell
+from apnpql_jax.robot.clock import Clock
+from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.protocols import Frame
+from apnpql_jax.robot.recorder import Recorder
+from apnpql_jax.robot.supervisor import CAMERAS, Mode
+from apnpql_jax.testing import export_untrained
+
+FRAMES = 8
+FAULT = "camera wrist: sent no frame for 0.2 s: check its cable"
+
+
+class Camera:
+  """A camera that is unplugged after some frames."""
+
+  def __init__(self, clock: Clock, view: dict[str, Any], frames: int):
+    self._clock, self._left = clock, frames
+    self._image = np.zeros((view["height"], view["width"], 3), np.uint8)
+
+  def get_observation(self) -> Frame:
+    self._left -= 1
+    if self._left < 0:
+      raise DeviceError(FAULT)
+    return Frame(self._clock.now(), self._image)
+
+
+def policy(folder: Path, board_name: str, peer: Any, clock: Clock) -> None:
+  """Runs the policy process with such cameras."""
+  contract = policy_folder.load(folder / "policy").contract
+
+  @contextlib.contextmanager
+  def cameras(robot: Robot) -> Generator[list[Camera]]:
+    views = robot.contract["cameras"]
+    yield [
+      Camera(clock, views[x], 1 + FRAMES) for x in CAMERAS
+    ]  # One before the first.
+
+  options = {
+    "policy": str(folder / "policy"),
+    "seed": 0,
+    "log": str(folder / "log"),
+    "replay": str(folder / "recorded"),
+  }
+  robot = Robot("double", contract, Cell(), clock)
+  with mock.patch.object(devices, "open_cameras", cameras):
+    policy_process.main(robot, board_name, options, peer)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+  """Returns a folder with a policy, and a log that moves the shoulder."""
+  pytest.importorskip("pyarrow")
+  made = tmp_path_factory.mktemp("policy-process")
+  contract = export_untrained(made / "policy", time_limit_s=30.0)
+  views = contract["cameras"]
+  images = [Camera(CLOCK, views[x], 1).get_observation() for x in CAMERAS]
+  state: dict[str, Any] = dict.fromkeys(("position", "command", "wrench"), np.zeros(6))
+  state |= dict.fromkeys(("gripper", "time", "gripper_time"), 0.0)
+  action = np.array([1.0, 0, 0, 0, 0, 0, 1])
+  with Recorder(made / "recorded", contract, judged=False) as recorder:
+    for _ in range(20):
+      recorder.add(0.0, 0.0, state, action, images)
+    recorder.end_episode(None)
+  return made
+
+
+def test_an_unplugged_camera_stops_the_arm_and_its_episode_is_in_the_log(folder):
+  contract = policy_folder.load(folder / "policy").contract
+  target = functools.partial(policy, folder)
+  with (
+    rig(target, contract) as (board, run),
+    Board(run.plant, simulation.RECORDS) as plant,
+  ):
+    until(lambda: bool(board["policy"].read()["ready"]))
+    board["order"].write(
+      {"number": 1, "phase": Phase.HOME, "target": NEUTRAL, "close": 1}
+    )
+    until(lambda: is_done(board, 1))
+    board["order"].write({"number": 2, "phase": Phase.PLAY})
+    until(lambda: text(board["policy"].read()["error"]) == FAULT)
+    assert speed(plant) > 0.3
+    assert until(lambda: speed(plant) < 0.01) < 0.5
+    until(lambda: not run.control.is_alive() and not run.policy.is_alive())
+    state, found = board["state"].read(), board["policy"].read()
+    assert (state["mode"], text(state["reason"])) == (Mode.STOP, FAULT)
+    assert state["at_rest"] and FAULT in run.reasons()
+    assert (found["ended"], found["index"], found["over"]) == (2, 0, 0)
+  (kept,) = lerobot.read(folder / "log").episodes
+  assert len(kept.actions) == found["actions"] == FRAMES
+  assert kept.success is None
+
+
+def compiling(peer: Any) -> None:
+  """A policy process that is not ready yet."""
+  never = threading.Event()
+  args = peer, never, threading.Event()
+  threading.Thread(target=policy_process._end_with, args=args, daemon=True).start()
+  never.wait(100.0)
+
+
+def test_a_policy_that_compiles_ends_at_once_with_the_control_process():
+  context = get_context("spawn")
+  ours, theirs = context.Pipe()
+  process = context.Process(target=compiling, args=(theirs,))
+  process.start()
+  theirs.close()
+  ours.close()
+  process.join(policy_process.END_S)
+  assert process.exitcode == 1

@@ -1,0 +1,90 @@
+"""Whole sessions on the simulated robot, whose processes are killed in an episode."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import json
+from pathlib import Path
+import threading
+import time
+from typing import Any
+
+import pytest
+
+from apnpql_jax.data import lerobot
+from apnpql_jax.robot import policy_folder
+from apnpql_jax.robot.board import Phase
+from apnpql_jax.robot.cell import Cell
+from apnpql_jax.robot.clock import Clock
+from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.episodes import Options
+from apnpql_jax.robot.run import EVENTS, run
+from apnpql_jax.robot.session import UNKNOWN, Session
+from apnpql_jax.testing import export_untrained
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory) -> Iterator[policy_folder.PolicyFolder]:
+  folder = tmp_path_factory.mktemp("session") / "policy"
+  export_untrained(folder, time_limit_s=30.0)
+  yield policy_folder.load(folder)
+
+
+def killed_in(
+  phase: Phase, name: str, policy: policy_folder.PolicyFolder, log: Path, monkeypatch
+) -> dict[str, Any]:
+  """Runs a session, one of whose processes is killed while its arm moves."""
+  wait = Session.wait_until_ready
+
+  def ready(session: Session) -> None:
+    wait(session)
+    threading.Thread(target=kill, args=(session,), daemon=True).start()
+
+  def kill(session: Session) -> None:
+    board, played = session.board, 3 if phase is Phase.PLAY else 0
+    while board["state"].read()["phase"] != phase:
+      time.sleep(0.01)
+    while board["policy"].read()["actions"] < played:
+      time.sleep(0.01)
+    assert session.processes is not None
+    session.processes.kill(name)
+
+  monkeypatch.setattr(Session, "wait_until_ready", ready)
+  robot = Robot("simulated", policy.contract, Cell(), Clock(8.0))
+  return run(robot, policy, Options(log=str(log)), episodes=3)
+
+
+def test_a_process_that_ends_before_the_first_episode_is_no_bad_input(
+  policy, tmp_path, monkeypatch, capsys
+):
+  pytest.importorskip("pyarrow")
+  found = killed_in(Phase.HOME, "policy", policy, tmp_path / "log", monkeypatch)
+  assert (found["exit_code"], found["episodes"]) == (3, 0)
+  assert "policy" in found["failure"] and "process has ended" in found["failure"]
+  assert found["arm"] == "the arm is at rest"
+  assert "the session ends after 0 of 3 episodes: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+  ("name", "rest"), [("control", UNKNOWN), ("policy", "the arm is at rest")]
+)
+def test_the_end_of_a_process_leaves_the_log_and_code_3(
+  policy, tmp_path, monkeypatch, capsys, name, rest
+):
+  pytest.importorskip("pyarrow")
+  log = tmp_path / "log"
+  found = killed_in(Phase.PLAY, name, policy, log, monkeypatch)
+  assert found["exit_code"] == 3 and found["episodes"] == 1
+  assert found["arm"] == rest and rest in capsys.readouterr().err
+  (line,) = (log / EVENTS).read_text().splitlines()
+  kept = json.loads(line)
+  assert "process has ended" in kept["reason"] == found["reasons"][0]
+  assert kept["actions"] >= 3 and kept["solved"] is None
+  episodes = lerobot.read(log).episodes
+  if name == "policy":  # It took its episode along.
+    assert (kept["dataset_index"], episodes) == (None, [])
+  else:
+    assert kept["dataset_index"] == 0
+    assert len(episodes[0].actions) == kept["actions"]
