@@ -26,7 +26,7 @@ _WAIT_S = 5.0
 """Time that a camera may take for its first frame."""
 
 _READINGS = 25
-"""Measurements of the joints, of whose ages the median counts."""
+"""Measurements of a device, of whose ages the median counts."""
 
 Stack = contextlib.ExitStack
 
@@ -61,8 +61,12 @@ def gripper(stack: Stack, table: Table, robot: Robot) -> Callable[[], float]:
   with table.row("gripper"):
     device = devices.make_gripper(robot)
     stack.enter_context(devices.connected(device))
-    angle = device.get_observation().angle
-    table.rows["gripper"] = f"{_text(device)}; at {angle:.2f} rad"
+    state, age = _newest(robot, device)
+    angle, most = state.angle, robot.cell.limits(robot.contract).gripper_age
+    measured = f"measured {1e3 * age:.0f} ms ago"
+    table.rows["gripper"] = f"{_text(device)}; at {angle:.2f} rad, {measured}"
+    if age > most:
+      table.fail("gripper", f"it was {measured}, the limit is {1e3 * most:.0f} ms")
     return table.guarded("gripper", lambda: device.get_observation().angle, angle)
   return lambda: 0.0
 
@@ -106,8 +110,8 @@ def _dark(robot: Robot) -> Sequence[Frame]:
   return [Frame(now, np.zeros(size, np.uint8)) for size in sizes]
 
 
-def _newest(robot: Robot, device: Any) -> tuple[ArmState, float]:
-  """Returns a measurement of the arm, and the median age of some, s."""
+def _newest(robot: Robot, device: Any) -> tuple[Any, float]:
+  """Returns a measurement of arm or gripper, and the median age of some, s."""
   found = []
   for _ in range(_READINGS):
     state = device.get_observation()

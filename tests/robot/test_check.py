@@ -72,7 +72,7 @@ class Gripper(Arm):
   """A gripper that only measures."""
 
   def get_observation(self) -> Any:
-    return GripperState(time.monotonic(), 1.1)
+    return GripperState(time.monotonic() - self.age, 1.1)
 
 
 @dataclasses.dataclass
@@ -103,6 +103,7 @@ class Bench:
   cameras: list[Camera]
   cell: Cell = Cell()
   act: Any = None
+  gripper: Gripper = dataclasses.field(default_factory=lambda: Gripper(np.zeros(6)))
 
   def check(self) -> dict[str, Any]:
     robot = Robot("double", self.policy.contract, self.cell)
@@ -117,7 +118,7 @@ def bench(exported, monkeypatch) -> Bench:
   found = Bench(policy, Arm(policy.neutral), [Camera(views[x]) for x in views])
   found.act = check_program.rest
   monkeypatch.setattr(devices, "make_arm", lambda robot, reads: found.arm)
-  monkeypatch.setattr(devices, "make_gripper", lambda robot: Gripper(np.zeros(6)))
+  monkeypatch.setattr(devices, "make_gripper", lambda robot: found.gripper)
   monkeypatch.setattr(
     devices, "open_cameras", lambda robot: contextlib.nullcontext(found.cameras)
   )
@@ -143,6 +144,10 @@ def test_a_cell_that_is_ready_has_all_rows(bench, capsys):
 
 def stale_joints(bench: Bench) -> None:
   bench.arm.age = 0.05
+
+
+def stale_gripper(bench: Bench) -> None:
+  bench.gripper.age = 0.4
 
 
 def protective_stop(bench: Bench) -> None:
@@ -200,6 +205,7 @@ def broken(bench: Bench) -> None:
   ("worsen", "row", "text"),
   [
     (stale_joints, "arm", "joints were measured 50 ms ago, the limit is 20 ms"),
+    (stale_gripper, "gripper", "it was measured 400 ms ago, the limit is 300 ms"),
     (protective_stop, "arm", "FAILS: protective stop"),
     (tool_outside, "tool", "is outside the workspace box: move the arm by hand"),
     (joint_outside, "tool", "is outside its range"),
@@ -242,7 +248,7 @@ def test_a_gripper_that_falls_silent_fails_once_and_not_the_program(bench, monke
 
     def get_observation(self) -> Any:
       self.asked += 1
-      if self.asked > 3:
+      if self.asked > 30:
         raise DeviceError("gripper: it does not answer")
       return super().get_observation()
 

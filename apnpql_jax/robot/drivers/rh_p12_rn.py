@@ -5,7 +5,8 @@ The tables are those of the manufacturer's e-Manual (emanual.robotis.com, pages
 firmware. A tick of the encoder is 1/4096 of a turn of the driven finger; the e-Manual
 shows ticks 0 (open) and 740 (closed). Velocities are those of the finger, too. (The
 file ``rh_p12_rn.model`` of the manufacturer's ROS 2 driver gives the unit of the old
-firmware for the new one, which would make its velocity limit 340 rev/min.)
+firmware for the new one, which would make its velocity limit 340 rev/min. It also maps
+740 ticks to 1.099 rad, 3 % less than the encoder's 12 bits per turn give.)
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
 """The UR5e arm, by the package ``ur_rtde`` (an e-Series controller, PolyScope 5.6+).
 
-Joint targets go by servoJ, one per control cycle of 2 ms. The controller holds the last
-target if none follows. The wrench is ``actual_TCP_force`` of RTDE, which an e-Series
-controller measures at the tool flange, in the axes of the base, without the payload,
-positive where the surroundings push the tool. The ports are those of every controller
-(dashboard 29999, script 30003, RTDE 30004); ``ur_rtde`` cannot change them.
+Joint targets go by servoJ, one per control cycle of 2 ms. The program of ``ur_rtde`` on
+the controller keeps the last target if none follows. The wrench is
+``actual_TCP_force`` of RTDE, which an e-Series controller gives at the tool flange, in
+the axes of the base, without the payload. Its sign, of which no document was found, is
+taken as that of the surroundings' push on the tool. The ports are those of every
+controller (dashboard 29999, script 30003, RTDE 30004); ``ur_rtde`` cannot change them.
 """
 
 from __future__ import annotations

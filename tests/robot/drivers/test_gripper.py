@@ -286,4 +286,4 @@ def test_the_checksums_are_those_of_the_protocols():
     data = rng.integers(0, 256, size).tolist()
     assert crc(bytes(data)) == sdk.PacketHandler(2.0).updateCRC(0, data, size)
   assert modbus_crc(b"123456789") == 0x4B37  # The check value of CRC-16/MODBUS.
-  assert math.isclose(TICK, 0.0015339807878856412)  # ``rh_p12_rn.model`` of ROBOTIS
+  assert math.isclose(math.degrees(TICK), 0.088, abs_tol=2e-4)  # e-Manual: precision
