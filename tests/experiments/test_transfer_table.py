@@ -196,9 +196,10 @@ def test_errors_of_the_command_end_the_script(tmp_path, monkeypatch, capsys):
   assert error.value.code == 2 and not list((tmp_path / "out").iterdir())
 
 
-def test_the_documents_have_the_stored_results():
-  found = [transfer_table.read(path) for path in transfer_table.OUT.glob("*.json")]
+@pytest.mark.parametrize("folder", ["", "pilot"])
+def test_the_documents_have_the_stored_results(folder):
+  out = transfer_table.OUT / folder
+  found = [transfer_table.read(path) for path in out.glob("*.json")]
   table = transfer_table.table(found)
-  page = (testing.ROOT / "docs" / "transfer.md").read_text()
-  assert len(found) > 0 and table in page
-  assert (transfer_table.OUT / "table.md").read_text() == table
+  assert len(found) > 0 and table in (testing.ROOT / "docs" / "transfer.md").read_text()
+  assert (out / "table.md").read_text() == table
