@@ -49,10 +49,16 @@ class Arm(simulated.SimulatedArm):
   """The simulated arm, whose cable may be pulled out."""
 
   lost_at = NEVER
+  waits = staticmethod(lambda: None)
+  """What happens until it is at rest."""
 
   def start(self, *, zero: bool = True) -> None:
     super().start(zero=zero)
     TurnedClock.time += 0.01  # The real one waits.
+
+  def stop(self) -> None:
+    super().stop()
+    self.waits()
 
   def get_observation(self) -> ArmState:
     found = super().get_observation()
@@ -106,13 +112,17 @@ class Rig:
     self.values = np.array([*(arm or STILL), float(close)])
     self.order(Phase.PLAY)
 
-  def turn(self, seconds: float = TIMESTEP) -> None:
-    """Runs the plant, then a cycle."""
+  def step(self, seconds: float) -> None:
+    """Runs the plant."""
     for _ in range(round(seconds / TIMESTEP)):
       TurnedClock.time += TIMESTEP
       self.simulation.obey(self.now)
       self.simulation.step()
     self.simulation.publish(self.now)
+
+  def turn(self, seconds: float = TIMESTEP) -> None:
+    """Runs the plant, then a cycle."""
+    self.step(seconds)
     if self.values is not None and self.control.phase is Phase.PLAY:
       self.actions += 1
       self.board["action"].write(
@@ -266,6 +276,18 @@ def test_fingers_that_move_stop_where_they_are(rig, close):
   assert after == pytest.approx(before, abs=0.02)
 
 
+def test_the_end_of_control_stops_the_fingers_before_it_waits_for_the_arm(rig):
+  rig.go_home(closed=True)
+  rig.run_until_done()
+  rig.play(1.0, 0, 0, 0, 0, 0, close=False)
+  rig.run(0.4)
+  before = rig.finger
+  rig.arm.waits = lambda: rig.step(0.3)
+  rig.control.close()
+  assert 0.1 < before < 1.0
+  assert rig.finger == pytest.approx(before, abs=0.02)
+
+
 def test_a_grip_stays_after_a_stop(rig):
   """Closed fingers press on each other with all of their limited torque."""
   stopped_while(rig, True, after=3.0)
@@ -274,6 +296,32 @@ def test_a_grip_stays_after_a_stop(rig):
   rig.go_home(closed=False)  # The next command is obeyed.
   rig.run_until_done()
   assert rig.finger < THERE_RAD
+
+
+def test_fingers_that_have_not_begun_to_move_are_no_grip(rig, monkeypatch):
+  rig.go_home(closed=False)
+  rig.run_until_done()
+  torque = motors.gripper_torque
+
+  def opening(angle, velocity, *_, **__):
+    return torque(angle, velocity, 0.0, np)
+
+  with monkeypatch.context() as patch:
+    patch.setattr(motors, "gripper_torque", opening)  # The command is on its way.
+    rig.play(close=True)
+    rig.run(0.4)
+    before = rig.finger
+    rig.control.end_motion("test")
+    rig.turn()
+  rig.run(0.5)
+  assert before < THERE_RAD
+  assert rig.finger == pytest.approx(before, abs=0.02)
+
+
+def test_no_finger_of_the_simulated_robot_moves_before_a_command(rig):
+  before = rig.finger
+  rig.run(0.5)
+  assert rig.finger == pytest.approx(before, abs=0.01)
 
 
 def test_the_fingers_move_again_after_they_were_stopped(rig):
