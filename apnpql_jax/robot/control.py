@@ -74,10 +74,10 @@ class Control:
     self._publish(state)
 
   def close(self) -> None:
-    """Brakes if the arm moves, and stops the fingers."""
+    """Stops the fingers, and brakes if the arm moves."""
+    self._hand.hold(self._clock.now())  # First: the arm may take a while.
     with contextlib.suppress(Exception):
       self._arm.stop()
-    self._hand.hold(self._clock.now())
 
   @property
   def _is_moving(self) -> bool:

@@ -76,20 +76,29 @@ class Core:
     limiter, measured = self.limiter, self._measured(now, state)
     mode, reason = self.supervisor.judge(now, state, action, limiter.position)
     if mode is Mode.FOLLOW and action is not None:
-      self._simulate(action.values[:6], measured, state.wrench)
-    elif mode is Mode.HOLD and self.supervisor.pressed and self.virtual.admittance:
-      self._simulate(np.zeros(6), measured, state.wrench)  # The arm gives way.
+      self.virtual.step(action.values[:6], measured, state.wrench)
+      self._follow_virtual(measured)
+    elif mode is Mode.HOLD and self._gives_way(measured, state.wrench):
+      self._follow_virtual(measured)
     else:
       limiter.brake(measured)
       self.virtual.synchronize(limiter.position, limiter.velocity)
     return Command(limiter.position.copy(), mode, reason, limiter.at_rest)
 
-  def _simulate(
-    self, desired: np.ndarray, measured: np.ndarray, wrench: np.ndarray
-  ) -> None:
-    """Moves as the virtual arm does with desired velocities f64[6], if allowed."""
+  def _gives_way(self, measured: np.ndarray, wrench: np.ndarray) -> bool:
+    """Feels the wrench f64[6] in a hold; returns whether it moves the virtual arm.
+
+    Only a hold because of a force, and only while the filtered wrench is beyond the
+    dead zone: otherwise nothing but training's weak motors would slow the arm.
+    """
+    if not (self.supervisor.pressed and self.virtual.admittance):
+      return False
+    self.virtual.step(np.zeros(6), measured, wrench)
+    return self.virtual.share > 0
+
+  def _follow_virtual(self, measured: np.ndarray) -> None:
+    """Moves as the virtual arm does, if allowed."""
     limiter, virtual = self.limiter, self.virtual
-    virtual.step(desired, measured, wrench)
     # Not the position, whose lead exceeds the limit of acceleration: 1.6 ms later.
     proposed = virtual.velocity
     limiter.step(proposed, measured, yielding=virtual.share > 0)

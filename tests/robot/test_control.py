@@ -49,10 +49,16 @@ class Arm(simulated.SimulatedArm):
   """The simulated arm, whose cable may be pulled out."""
 
   lost_at = NEVER
+  waits = staticmethod(lambda: None)
+  """What happens until it is at rest."""
 
   def start(self, *, zero: bool = True) -> None:
     super().start(zero=zero)
     TurnedClock.time += 0.01  # The real one waits.
+
+  def stop(self) -> None:
+    super().stop()
+    self.waits()
 
   def get_observation(self) -> ArmState:
     found = super().get_observation()
@@ -106,13 +112,17 @@ class Rig:
     self.values = np.array([*(arm or STILL), float(close)])
     self.order(Phase.PLAY)
 
-  def turn(self, seconds: float = TIMESTEP) -> None:
-    """Runs the plant, then a cycle."""
+  def step(self, seconds: float) -> None:
+    """Runs the plant."""
     for _ in range(round(seconds / TIMESTEP)):
       TurnedClock.time += TIMESTEP
       self.simulation.obey(self.now)
       self.simulation.step()
     self.simulation.publish(self.now)
+
+  def turn(self, seconds: float = TIMESTEP) -> None:
+    """Runs the plant, then a cycle."""
+    self.step(seconds)
     if self.values is not None and self.control.phase is Phase.PLAY:
       self.actions += 1
       self.board["action"].write(
@@ -264,6 +274,18 @@ def test_fingers_that_move_stop_where_they_are(rig, close):
   before, after = stopped_while(rig, close, after=0.4)
   assert 0.1 < before < 1.0
   assert after == pytest.approx(before, abs=0.02)
+
+
+def test_the_end_of_control_stops_the_fingers_before_it_waits_for_the_arm(rig):
+  rig.go_home(closed=True)
+  rig.run_until_done()
+  rig.play(1.0, 0, 0, 0, 0, 0, close=False)
+  rig.run(0.4)
+  before = rig.finger
+  rig.arm.waits = lambda: rig.step(0.3)
+  rig.control.close()
+  assert 0.1 < before < 1.0
+  assert rig.finger == pytest.approx(before, abs=0.02)
 
 
 def test_a_grip_stays_after_a_stop(rig):

@@ -290,6 +290,22 @@ def test_a_hold_because_of_a_force_gives_way_to_it():
   assert max(force for force, _ in found[follows:]) < LIMITS.hold_force
 
 
+def test_a_hold_brakes_once_the_force_is_gone():
+  """A hit of 20 ms: the filtered wrench soon is that of a free hand."""
+  world = moving()
+  push(45)(world)
+  for _ in range(10):
+    world.step()
+  push(0)(world)
+  speeds, free = [], []
+  while world.step().mode is Mode.HOLD:
+    speeds.append(np.abs(world.core.limiter.velocity).max())
+    free.append(world.core.virtual.share == 0)
+  assert np.flatnonzero(free)[0] * TIMESTEP < 0.05 < 0.15 < len(free) * TIMESTEP
+  slowing = -np.diff(speeds)[free[1:]] / TIMESTEP
+  np.testing.assert_allclose(slowing, BRAKING, rtol=1e-6)
+
+
 def test_without_admittance_a_hold_because_of_a_force_stays_pressed_and_stops():
   found = pressed_on_a_wall(World(admittance=None), 5e3, 0.05, 3.0)
   modes = [command.mode for _, command in found]

@@ -212,7 +212,9 @@ class RHP12RN:
     """Reads and commands until the end; an error stays until the next ``connect``."""
     asked = 0.0
     done: tuple[int, int] | None = None
-    while not self._ending.wait(_PERIOD):
+    ending = False
+    while not ending:
+      ending = self._ending.wait(_PERIOD)  # A last pass sends what came before the end.
       try:
         state = self._read_state()
         self._state = state

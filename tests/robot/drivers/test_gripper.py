@@ -144,6 +144,23 @@ def test_fingers_on_their_way_are_held(close):
     settle(gripper, 1.1 if close else 0.0)
 
 
+def test_a_hold_at_the_end_still_holds(monkeypatch):
+  """As when the control process ends: the driver is closed at once."""
+  monkeypatch.setattr(driver, "_PERIOD", 0.1)  # It comes between two readings.
+  with bench() as (host, port), held(port) as gripper:
+    gripper.send_action(True)
+    settle(gripper, 1.1)
+    gripper.send_action(False)
+    end = time.monotonic() + 6
+    while gripper.get_observation().angle > 0.9:
+      assert time.monotonic() < end
+      time.sleep(0.005)
+    gripper.hold()
+    gripper.disconnect()
+    time.sleep(1.0)
+    assert ask(host, "state")["finger"] > 0.6
+
+
 def test_the_gap_closes_at_the_speed_of_the_training():
   with bench() as (_, port), held(port) as gripper:
     gripper.send_action(False)
