@@ -7,12 +7,9 @@ import contextlib
 from typing import Any, TypeVar
 
 from apnpql_jax.console import print_line
-from apnpql_jax.errors import UserError, one_line
+from apnpql_jax.errors import NOT_READY, UserError, one_line
 
 T = TypeVar("T")
-
-NOT_READY = 2
-"""Exit code if a row fails."""
 
 
 class Table:

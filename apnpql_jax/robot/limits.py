@@ -99,7 +99,7 @@ class Limits:
   gripper_age: float = 0.3
   """Age of the gripper's measurement from which the arm stops, s.
 
-  Its line is slow: a message takes up to 20 ms, and the settings that go with the first
+  Its line is slow: a message takes up to 22 ms, and the settings that go with the first
   command are about ten. A driver that notices silence itself stops the arm earlier.
   """
 

@@ -10,8 +10,6 @@ from typing import Any
 from apnpql_jax.robot import control_process, policy_process
 from apnpql_jax.robot.devices import Robot
 
-NAMES = "control", "policy"
-
 
 class Processes:
   """Both processes, each of which ends with the other."""

@@ -3,7 +3,7 @@
 Method names are those of LeRobot's ``Robot``. Drivers raise ``errors.DeviceError`` with
 one line when a device is missing, silent or another one than expected. All times are
 those of ``time.monotonic``, in s. Angles are in rad, in the order of the contract's
-``joints.state``. No module of this room imports JAX, except the policy's.
+``joints.state``. The control process and the drivers import no JAX.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Device(Protocol):
     ...
 
   def describe(self) -> dict[str, Any]:
-    """Returns model, serial number and versions, for the log."""
+    """Returns model, serial number and versions, for ``check`` and ``calibrate``."""
     ...
 
 

@@ -21,11 +21,6 @@ LeRobot's policies, which take all columns of "observation"."""
 _AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
 
 
-def check_available() -> None:
-  """Raises ``ConfigError`` if logs cannot be written or read."""
-  lerobot.check_available()
-
-
 class Recorder:
   """Writes episodes when they end, because encoding takes longer than a period."""
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 import contextlib
 import dataclasses
 import json
 from pathlib import Path
+import shutil
 import signal
 from typing import Any
 
 from apnpql_jax.console import print_line
+from apnpql_jax.data import lerobot
 from apnpql_jax.errors import (
   FAILED,
   DeviceError,
@@ -19,7 +21,7 @@ from apnpql_jax.errors import (
   UserError,
   one_line,
 )
-from apnpql_jax.robot import recorder, replay
+from apnpql_jax.robot import replay
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.episodes import Options, Outcome
 from apnpql_jax.robot.policy_folder import PolicyFolder
@@ -36,7 +38,8 @@ def run(
 ) -> dict[str, Any]:
   """Plays episodes, each from the neutral pose, and prints a line about each.
 
-  A fault ends its episode, and the next one begins, unless the arm cannot go home.
+  A fault ends its episode, and the next one begins, unless the arm cannot go home. On a
+  ur5e it also ends the session.
 
   Returns:
     Counts, reasons, and the success rate if a simulated robot can judge it. If the
@@ -44,18 +47,15 @@ def run(
 
   Raises:
     ConfigError: A package is missing.
-    FileError: The log exists, or the one to replay is none or not of this policy.
+    FileError: The log exists, or the log to replay is no log or does not fit the
+      policy.
     DeviceError: A device or process has failed before the arm moved.
     RunStopped: SIGINT, SIGTERM or SIGHUP came; with what is known about the arm.
   """
-  if options.log is not None:
-    recorder.check_available()
-    if Path(options.log).exists():
-      raise FileError(f"{options.log!r} exists; name another folder with --log")
   if options.replay is not None:
     replay.recorded_actions(Path(options.replay), policy.contract)
   outcomes: list[Outcome] = []
-  with catching_signals() as caught:
+  with _new_log(options.log, outcomes), catching_signals() as caught:
     session = Session(robot, policy, options, caught)
     try:
       with session:
@@ -93,6 +93,24 @@ def _play(
   except (UserError, OSError) as error:
     return one_line(error)
   return ""
+
+
+@contextlib.contextmanager
+def _new_log(folder: str | None, outcomes: Sequence[Outcome]) -> Generator[None]:
+  """Makes the folder of a log; removes it if no episode is played, for another try."""
+  if folder is None:
+    yield
+    return
+  lerobot.check_available()
+  try:
+    Path(folder).mkdir(parents=True)
+  except FileExistsError:
+    raise FileError(f"{folder!r} exists; name another folder with --log") from None
+  try:
+    yield
+  finally:
+    if not outcomes:
+      shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -155,7 +173,7 @@ def _summary(
       "success_rate": solved / len(judged),
       "ci95": wilson_interval(solved, len(judged)),
     }
-  if options.log is not None:
+  if options.log is not None and outcomes:
     found["log"] = options.log
   if failure:
     found |= {"failure": failure, "exit_code": FAILED}

@@ -31,12 +31,18 @@ from apnpql_jax.robot import (
   setup,
 )
 from apnpql_jax.robot.arm_model import ArmModel
+from apnpql_jax.robot.calibration import files, limits
+from apnpql_jax.robot.calibration.lenses import Lens
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.doubles.server import ask
+from apnpql_jax.robot.drivers import realsense
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.protocols import ArmState, Frame, GripperState
+from apnpql_jax.robot.supervisor import CAMERAS
 from apnpql_jax.testing import export_untrained
+
+OPEN_CAMERAS = devices.open_cameras
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +88,10 @@ class Camera:
   view: dict[str, Any]
   age: float = 0.03
   most: int = 1000
+
+  def connect(self) -> None: ...
+
+  def disconnect(self) -> None: ...
 
   def describe(self) -> dict[str, Any]:
     return {"model": "D435"}
@@ -266,6 +276,28 @@ def test_a_real_arm_is_checked_before_its_calibration(bench, tmp_path, monkeypat
   found = check.check(robot, bench.policy)
   assert found["not_ready"] == ["calibration"]
   assert "calibration.json does not exist; make it with" in found["calibration"]
+
+
+def test_a_camera_that_has_moved_fails_the_calibration_alone(
+  bench, tmp_path, monkeypatch
+):
+  contract, calibrated = bench.policy.contract, {}
+  for name in CAMERAS:
+    pose, entry = limits.place(contract, name)
+    pose[0, 3] += 0.02 * (name == "global")
+    lens = Lens(480, 848, 430.0, 430.0, 423.5, 239.5)
+    about = {"lens_from": "views"}
+    calibrated[name] = files.CalibratedCamera(name, lens, entry, pose, about)
+  path = tmp_path / "calibration.json"
+  files.save(path, files.Calibration("now", "0", "board", calibrated))
+  bench.cell = Cell(calibration=path, cameras={x: x for x in CAMERAS})
+  cameras = dict(zip(CAMERAS, bench.cameras, strict=True))
+  monkeypatch.setattr(devices, "open_cameras", OPEN_CAMERAS)
+  monkeypatch.setattr(realsense, "RealSense", lambda serial, **kw: cameras[serial])
+  found = check.check(Robot("ur5e", contract, bench.cell), bench.policy)
+  assert found["not_ready"] == ["calibration"]
+  assert "20.0 mm off along x" in found["calibration"]
+  assert "frames of 3" in found["camera global"]
 
 
 def test_the_force_is_shown_in_the_world(bench):

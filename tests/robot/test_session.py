@@ -65,6 +65,7 @@ def test_a_process_that_ends_before_the_first_episode_is_no_bad_input(
   assert "policy" in found["failure"] and "process has ended" in found["failure"]
   assert found["arm"] == "the arm is at rest"
   assert "the session ends after 0 of 3 episodes: " in capsys.readouterr().err
+  assert not (tmp_path / "log").exists() and "log" not in found
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,8 @@ publish the registers of Modbus. Those who use it (the project
 ``Doosan-E0509-ROBOTIS-RH-P12-RN-TCP-Bridge`` on GitHub) find the bytes of addresses 2n
 and 2n + 1 of the control table in register n, low byte first.
 
-At 57,600 baud, the 29 bytes of a reading of four bytes take 5 ms, the gripper waits up
-to 0.5 ms before it answers, and a USB adapter by FTDI hands bytes over every 16 ms
+At 57,600 baud, a reading of four bytes takes 5.5 ms on the line: 29 bytes, and up to
+0.5 ms before the gripper answers. A USB adapter by FTDI hands bytes over every 16 ms
 unless its latency timer is set lower. So an answer arrives within 22 ms. Both buses
 wait about 37 ms for it and try three times: a silent line is an error within 0.12 s.
 """

@@ -26,10 +26,10 @@ class Listener:
     """See ``protocols.Device``; in local and in remote control.
 
     Raises:
-      DeviceError: Nothing answers.
+      DeviceError: Nothing answers, or another device than expected.
     """
     receive = vendor("rtde_receive", "ur_rtde")
-    check_rtde(self._host)
+    self._identify()
     try:
       self._receive = receive.RTDEReceiveInterface(self._host, 1 / TIMESTEP, VARIABLES)
     except Exception as error:  # ur_rtde raises several kinds.
@@ -57,22 +57,19 @@ class Listener:
       raise DeviceError(f"{self._host}: lost the connection: check network and power")
     return self._reports.measure(following=False)
 
+  def _identify(self) -> None:
+    """Raises ``DeviceError`` unless a controller answers."""
+    check_rtde(self._host)
+
 
 class Inspector(Listener):
-  """An arm before a run: what it is, and what would keep it from following."""
+  """An arm before a run: what it is, and what would keep it from following.
+
+  It sends no program, unlike the arm of a run, and connects to a UR5e only.
+  """
 
   _about: dict[str, Any] | None = None
   _remote = False
-
-  def connect(self) -> None:
-    """See ``protocols.Device``; sends no program, unlike the arm of a run.
-
-    Raises:
-      DeviceError: Nothing answers, or it is not a UR5e.
-    """
-    dashboard = vendor("dashboard_client", "ur_rtde")
-    self._about, self._remote = identify(self._host, dashboard)
-    super().connect()
 
   def describe(self) -> dict[str, Any]:
     """See ``protocols.Device``."""
@@ -84,3 +81,8 @@ class Inspector(Listener):
     if self._reports is not None and (slowed := self._reports.slowed):
       found.append(slowed)
     return found
+
+  def _identify(self) -> None:
+    """Raises ``DeviceError`` unless a UR5e answers."""
+    dashboard = vendor("dashboard_client", "ur_rtde")
+    self._about, self._remote = identify(self._host, dashboard)
