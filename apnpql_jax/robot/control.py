@@ -95,7 +95,8 @@ class Control:
     stopped = command.mode is Mode.STOP
     if stopped:
       self._hand.hold(now)
-    if stopped and (command.at_rest or state.fault) or home and self._is_home(command):
+    ended = stopped and (command.at_rest or state.fault)
+    if ended or (home and self._is_home(command)):
       self._rest()
     else:
       self._arm.send_action(command.position)
@@ -113,10 +114,10 @@ class Control:
     command = core.move(now, state, self._target)
     if command.mode is Mode.FOLLOW:
       hand.move(now, self._closed)
-      if core.has_arrived(self._target) and now - hand.since > GRIP_S:
-        if not hand.is_at(self._closed):
-          angle = hand.state.angle
-          core.supervisor.stop(f"gripper: still at {angle:.2f} rad after {GRIP_S:g} s")
+      waited = core.has_arrived(self._target) and now - hand.since > GRIP_S
+      if waited and not hand.is_at(self._closed):
+        angle = hand.state.angle
+        core.supervisor.stop(f"gripper: still at {angle:.2f} rad after {GRIP_S:g} s")
     return command
 
   def _is_home(self, command: Command) -> bool:

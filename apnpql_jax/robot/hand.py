@@ -13,8 +13,12 @@ from apnpql_jax.robot.protocols import Gripper
 THERE_RAD = 0.05
 """Distance from its end at which the gripper counts as open or closed, rad."""
 
-_STILL_RAD, _STILL_S = 0.01, 0.2
-"""Fingers that move less than this, rad, for this time, s, stand still."""
+_STILL_RAD, _STILL_S = 0.01, 0.5
+"""Fingers that move less than this, rad, for this time, s, stand still.
+
+The driver writes its settings for about 0.3 s before the fingers obey the first
+command. They must not count as a grip meanwhile.
+"""
 
 
 class Hand:

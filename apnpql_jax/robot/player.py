@@ -144,7 +144,7 @@ class Player:
       delay = now - begin - number * period
       number = next_period(number, now - begin, period)
       self.board["policy"].write(
-        {"actions": actions, "missed": number - actions, "delay": delay}
+        {"actions": actions, "missed": min(number, most) - actions, "delay": delay}
       )
       self._wait(begin + number * period)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 import contextlib
 import signal
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -42,13 +42,14 @@ class Session(contextlib.AbstractContextManager):
     options: Options,
     signals: Sequence[int] = (),
   ):
-    """Starts the processes; ``wait_until_ready`` follows.
+    """Prepares the session; entering the context starts its processes.
 
     Methods raise ``RunStopped`` as soon as there are ``signals``, a list that grows;
     leave the context then.
     """
     self._signals = signals
-    self._policy, self._clock = policy, robot.clock
+    self._robot, self._policy, self._options = robot, policy, options
+    self._clock = robot.clock
     self._judged = robot.can_judge
     self._scene = 0
     self._events: list[tuple[float, str, str]] = []
@@ -61,27 +62,19 @@ class Session(contextlib.AbstractContextManager):
     self._plant: Board | None = None
     self.processes: Processes | None = None
     """The control and the policy process."""
+
+  def __enter__(self) -> Self:
+    """Starts the processes; ``wait_until_ready`` follows.
+
+    Raises:
+      DeviceError: The simulated robot does not start.
+    """
     try:
-      if robot.kind == "simulated":
-        started = simulated.started(
-          robot, seed=options.seed, latency_s=options.latency_s
-        )
-        robot = self._stack.enter_context(started)
-        self._plant = self._stack.enter_context(simulated.opened(robot))
-      self.processes = Processes(
-        robot,
-        self.board.name,
-        control={"admittance": options.admittance},
-        policy={
-          "policy": str(policy.path),
-          "seed": options.seed,
-          "log": options.log,
-          "replay": options.replay,
-        },
-      )
+      self._start(self._robot, self._options)
     except BaseException:
       self.close()
       raise
+    return self
 
   def __exit__(self, *error: object) -> None:
     self.close()
@@ -134,8 +127,9 @@ class Session(contextlib.AbstractContextManager):
     policy = self._ended(number)
     self._take_events()
     solved = bool(policy["solved"])
+    judged = self._judged and whole and policy["actions"]
     return Outcome(
-      solved=solved if self._judged and whole else None,
+      solved=solved if judged else None,
       reason=reason or (SOLVED if solved else TIME_LIMIT),
       actions=int(policy["actions"]),
       seconds=seconds,
@@ -153,9 +147,7 @@ class Session(contextlib.AbstractContextManager):
       DeviceError: A device or process has failed, with its reason.
     """
     self._take_events()
-    if self._signals:
-      name = signal.Signals(self._signals[0]).name
-      raise RunStopped(name, INTERRUPTED + self._signals[0])
+    self._check_signals()
     failure = self._failure or text(self.board["policy"].read()["error"])
     if not failure and self._plant is not None:
       failure = text(self._plant["plant"].read()["error"])
@@ -179,6 +171,33 @@ class Session(contextlib.AbstractContextManager):
       self.processes.end(0.0, END_S)
       self.processes = None
     self._stack.close()
+
+  def _start(self, robot: Robot, options: Options) -> None:
+    if robot.kind == "simulated":
+      started = simulated.started(
+        robot,
+        seed=options.seed,
+        latency_s=options.latency_s,
+        watch=self._check_signals,
+      )
+      robot = self._stack.enter_context(started)
+      self._plant = self._stack.enter_context(simulated.opened(robot))
+    self.processes = Processes(
+      robot,
+      self.board.name,
+      control={"admittance": options.admittance},
+      policy={
+        "policy": str(self._policy.path),
+        "seed": options.seed,
+        "log": options.log,
+        "replay": options.replay,
+      },
+    )
+
+  def _check_signals(self) -> None:
+    if self._signals:
+      name = signal.Signals(self._signals[0]).name
+      raise RunStopped(name, INTERRUPTED + self._signals[0])
 
   def _new_scene(self, plant: Board) -> None:
     """Places the objects of the next reset state."""

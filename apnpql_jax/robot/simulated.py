@@ -5,11 +5,10 @@ They are on the board of the process, see ``simulation``; nothing here imports J
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 import contextlib
 import dataclasses
 from multiprocessing import get_context
-import time
 from typing import Any
 
 import numpy as np
@@ -17,8 +16,12 @@ import numpy as np
 from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot.board import Board, text
 from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.orders import comes_true
 from apnpql_jax.robot.protocols import ArmState, GripperState
 from apnpql_jax.robot.simulation import CLOSE, HOLD, OPEN, RECORDS, main
+
+_START_S = 120.0
+"""Time that the plant may take to start, s; a busy machine imports slowly."""
 
 
 class _OnBoard:
@@ -98,16 +101,23 @@ class SimulatedGripper(_OnBoard):
 
 
 @contextlib.contextmanager
-def started(robot: Robot, *, seed: int = 0, latency_s: float = 0.0) -> Generator[Robot]:
+def started(
+  robot: Robot,
+  *,
+  seed: int = 0,
+  latency_s: float = 0.0,
+  watch: Callable[[], None] = lambda: None,
+) -> Generator[Robot]:
   """Starts the plant of a simulated robot and yields how to open it; others as given.
 
   Args:
     robot: The robot.
     seed: Random seed of reset states and noise.
     latency_s: Delay of commands, s.
+    watch: Is called while the plant starts; what it raises ends that.
 
   Raises:
-    DeviceError: The plant does not start.
+    DeviceError: The plant does not start, or takes too long.
   """
   if robot.kind != "simulated" or robot.plant:
     yield robot
@@ -118,12 +128,17 @@ def started(robot: Robot, *, seed: int = 0, latency_s: float = 0.0) -> Generator
       target=main, args=(board.name, robot.contract["task"], settings), daemon=True
     )
     process.start()
+
+    def is_ready() -> bool:
+      watch()
+      error = text(board["plant"].read()["error"])
+      if error or not process.is_alive():
+        raise DeviceError(f"simulated robot: {error or 'it does not start'}")
+      return bool(board["plant"].read()["ready"])
+
     try:
-      while not board["plant"].read()["ready"]:
-        error = text(board["plant"].read()["error"])
-        if error or not process.is_alive():
-          raise DeviceError(f"simulated robot: {error or 'it does not start'}")
-        time.sleep(0.01)
+      if not comes_true(is_ready, _START_S):
+        raise DeviceError(f"simulated robot: it is not ready after {_START_S:g} s")
       yield dataclasses.replace(robot, plant=board.name)
     finally:
       board["scene"].write({"quit": 1})

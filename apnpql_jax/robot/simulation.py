@@ -45,8 +45,8 @@ RECORDS = {
   "scene": [("number", "i8"), ("parked", "i8"), ("quit", "i8")],
 }
 
-OPEN, CLOSE, HOLD = range(3)
-"""Commands to the gripper."""
+HOLD, OPEN, CLOSE = range(3)
+"""Commands to the gripper; the empty record moves nothing."""
 
 _CATCH_UP_S = 0.02
 """Delay that the plant makes up for; a longer one lets its time stand still."""

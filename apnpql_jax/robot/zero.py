@@ -24,7 +24,7 @@ from apnpql_jax.robot.protocols import Arm
 from apnpql_jax.robot.sensor import load
 
 _READINGS = 50
-"""Number of readings that are averaged: 0.1 s."""
+"""Number of readings that are averaged at most: 0.1 s."""
 
 
 class Zero:
@@ -54,6 +54,7 @@ class Zero:
     if not refusal:
       arm.start(zero=again or not self._known)
       self._known = True
+      self._readings.clear()  # Those before the zero; the same cycle adds a new one.
     return refusal
 
   def _refusal(self) -> str:

@@ -144,6 +144,32 @@ def test_a_grip_stays_after_a_stop(rig):
   assert rig.finger < THERE_RAD
 
 
+def test_fingers_that_have_not_begun_to_move_are_no_grip(rig, monkeypatch):
+  rig.go_home(closed=False)
+  rig.run_until_done()
+  torque = motors.gripper_torque
+
+  def opening(angle, velocity, *_, **__):
+    return torque(angle, velocity, 0.0, np)
+
+  with monkeypatch.context() as patch:
+    patch.setattr(motors, "gripper_torque", opening)  # The command is on its way.
+    rig.play(close=True)
+    rig.run(0.4)
+    before = rig.finger
+    rig.control.end_motion("test")
+    rig.turn()
+  rig.run(0.5)
+  assert before < THERE_RAD
+  assert rig.finger == pytest.approx(before, abs=0.02)
+
+
+def test_no_finger_of_the_simulated_robot_moves_before_a_command(rig):
+  before = rig.finger
+  rig.run(0.5)
+  assert rig.finger == pytest.approx(before, abs=0.01)
+
+
 def test_the_fingers_move_again_after_they_were_stopped(rig):
   stopped_while(rig, True, after=0.4)
   rig.go_home(closed=True)

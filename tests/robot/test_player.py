@@ -119,6 +119,12 @@ def test_a_late_policy_drops_periods_and_keeps_their_grid(board, late):
   assert episode.found["actions"] == 10 - dropped  # The time limit stays.
 
 
+def test_no_period_after_the_time_limit_is_missed(board):
+  episode = Episode(board, lambda i: 0.46 if i == 9 else 0.005)
+  episode.play()
+  assert (episode.found["actions"], episode.found["missed"]) == (10, 0)
+
+
 @pytest.mark.parametrize(
   ("elapsed", "number"), [(0.01, 4), (0.46, 4), (0.599, 4), (0.61, 5), (1.2, 8)]
 )

@@ -1,18 +1,21 @@
-"""Whole sessions on the simulated robot, whose processes are killed in an episode."""
+"""Sessions on the simulated robot that end early, also as processes are killed."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 import json
 from pathlib import Path
+import signal
 import threading
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from apnpql_jax.data import lerobot
-from apnpql_jax.robot import policy_folder
+from apnpql_jax.errors import DeviceError, RunStopped
+from apnpql_jax.robot import policy_folder, simulated
 from apnpql_jax.robot.board import Phase
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
@@ -20,9 +23,43 @@ from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.episodes import Options
 from apnpql_jax.robot.run import EVENTS, run
 from apnpql_jax.robot.session import UNKNOWN, Session
+from apnpql_jax.robot.supervisor import Mode
 from apnpql_jax.testing import export_untrained
 
-pytestmark = pytest.mark.slow
+CONTRACT: dict[str, Any] = {"task": "push_plate", "time_limit_s": 1.5}
+POLICY = policy_folder.PolicyFolder(Path("policy"), CONTRACT)
+ROBOT = Robot("simulated", CONTRACT, Cell(), Clock())
+
+
+def test_an_episode_that_never_began_is_not_judged():
+  """The control process refuses it, so the policy does not play."""
+  session = Session(ROBOT, POLICY, Options())
+  control: Any = SimpleNamespace(ended=[], events=list, is_alive=lambda _: False)
+  session.processes = control
+  refused = {"number": 1, "done": 1, "mode": Mode.STOP, "reason": b"free the hand"}
+  session.board["state"].write(refused)
+  outcome = session.play()
+  assert (outcome.reason, outcome.actions) == ("free the hand", 0)
+  assert outcome.solved is None
+  session.processes = None
+  session.close()
+
+
+def test_a_signal_ends_the_start_of_the_plant():
+  session = Session(ROBOT, POLICY, Options(), [signal.SIGTERM])
+  with pytest.raises(RunStopped, match="SIGTERM") as stop, session:
+    pass
+  assert stop.value.code == 128 + signal.SIGTERM
+  assert session.rest == "the arm has not moved"
+
+
+def test_the_start_of_the_plant_takes_no_longer_than_it_may(monkeypatch):
+  monkeypatch.setattr(simulated, "_START_S", 0.1)
+  with (
+    pytest.raises(DeviceError, match=r"simulated robot: it is not ready after 0.1 s"),
+    simulated.started(ROBOT),
+  ):
+    pass
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +93,7 @@ def killed_in(
   return run(robot, policy, Options(log=str(log)), episodes=3)
 
 
+@pytest.mark.slow
 def test_a_process_that_ends_before_the_first_episode_is_no_bad_input(
   policy, tmp_path, monkeypatch, capsys
 ):
@@ -68,6 +106,7 @@ def test_a_process_that_ends_before_the_first_episode_is_no_bad_input(
   assert not (tmp_path / "log").exists() and "log" not in found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
   ("name", "rest"), [("control", UNKNOWN), ("policy", "the arm is at rest")]
 )

@@ -78,6 +78,17 @@ def test_a_free_hand_is_zeroed_before_each_episode(rig):
     assert rig.order(Phase.IDLE)["done"]
 
 
+def test_the_check_forgets_readings_from_before_the_first_zero(rig):
+  """An arm in the neutral pose is there within a few cycles."""
+  rig.plant.put_arm(NEUTRAL)
+  rig.idle()
+  assert load(rig.plant.arm_state(0.0).wrench) > 1  # Not zeroed yet.
+  begin = Device.time
+  assert rig.order(Phase.HOME)["done"]
+  assert Device.time - begin < 0.05
+  assert rig.order(Phase.PLAY, seconds=0.1)["mode"] == Mode.HOLD
+
+
 def test_a_hand_that_something_presses_on_is_not_zeroed_and_does_not_move(rig):
   rig.order(Phase.HOME)
   rig.press(PRESS)

@@ -70,6 +70,7 @@ class RHP12RN:
     self._share = current_share
     self._bus: buses.Bus | None = None
     self._table: Table | None = None
+    self._fastest = 0
     self._about: dict[str, Any] = {}
     self._thread: threading.Thread | None = None
     self._ending = threading.Event()
@@ -141,7 +142,7 @@ class RHP12RN:
     """
     self._check()
     if self._goal is not None and self._state:
-      self._goal = min(max(round(self._state.angle / TICK), OPEN), CLOSED)
+      self._goal = _goal_at(self._state.angle)
 
   def _check(self) -> None:
     if self._error:
@@ -151,25 +152,23 @@ class RHP12RN:
 
   def _identify(self) -> tuple[buses.Bus, Table]:
     """Returns the bus on which a gripper answers, and its control table."""
-    bus: buses.Bus = buses.Dynamixel(self._where, self._baud, self._id)
-    try:
-      return bus, self._table_of(bus)
-    except buses.Silent:
-      bus.close()
-    try:
-      bus = buses.Modbus(self._where, self._baud, self._id)
-      return bus, self._table_of(bus)
-    except buses.Silent:
-      bus.close()
-      raise DeviceError(
-        f"nothing answers at {self._where}, ID {self._id}, {self._baud} baud, neither "
-        "by Dynamixel 2.0 nor by Modbus-RTU: check power, cable, ID and baud rate"
-      ) from None
+    for kind in (buses.Dynamixel, buses.Modbus):
+      bus = kind(self._where, self._baud, self._id)
+      try:
+        return bus, self._table_of(bus)
+      except buses.Silent:
+        bus.close()
+      except DeviceError:
+        bus.close()
+        raise
+    raise DeviceError(
+      f"nothing answers at {self._where}, ID {self._id}, {self._baud} baud, neither by "
+      "Dynamixel 2.0 nor by Modbus-RTU: check power, cable, ID and baud rate"
+    )
 
   def _table_of(self, bus: buses.Bus) -> Table:
     number = int.from_bytes(bus.read(0, 2), "little")
     if number not in TABLES:
-      bus.close()
       names = " or ".join(f"{x.name} ({x.model_number})" for x in TABLES.values())
       raise DeviceError(
         f"the device at {self._where} has model number {number}, not {names}"
@@ -204,7 +203,8 @@ class RHP12RN:
     # A profile with acceleration is the only one whose velocity can change on the way.
     self._write(table.acceleration, self._read(table.acceleration_limit))
     self._write(table.goal_current, self._current(table))
-    here = min(max(self._ticks(), OPEN), CLOSED)  # It refuses a goal beyond its range.
+    self._state = self._read_state()  # The last one is old by now.
+    here = _goal_at(self._state.angle)
     self._command(here, self._velocity(0.0))
     self._write(table.torque_enable, 1)
 
@@ -273,3 +273,8 @@ class RHP12RN:
   def _open_bus(self) -> buses.Bus:
     assert self._bus
     return self._bus
+
+
+def _goal_at(angle: float) -> int:
+  """Returns the goal at an angle, rad; the gripper refuses one beyond its range."""
+  return min(max(round(angle / TICK), OPEN), CLOSED)

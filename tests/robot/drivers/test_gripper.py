@@ -6,6 +6,7 @@ from collections.abc import Generator
 import contextlib
 import math
 import os
+from pathlib import Path
 import sys
 import threading
 import time
@@ -31,6 +32,7 @@ from apnpql_jax.robot.drivers.rh_p12_rn import (
   finger_speed,
   pad_gap,
 )
+from apnpql_jax.robot.limits import Limits
 
 sdk = pytest.importorskip("dynamixel_sdk", reason="needs dynamixel-sdk")
 
@@ -38,6 +40,9 @@ MODELS = {35073: "RH-P12-RN", 35074: "RH-P12-RN(A)"}
 BUSES = [(35073, "Dynamixel 2.0"), (35074, "Dynamixel 2.0"), (35074, "Modbus-RTU")]
 ADDRESSES = {35073: (562, 596, 611), 35074: (512, 564, 580)}
 """Torque enable, goal position and present position in the e-Manual."""
+
+ANSWER_S = 0.022
+"""Time that an answer takes, see ``buses``."""
 
 
 @contextlib.contextmanager
@@ -159,6 +164,33 @@ def test_a_hold_at_the_end_still_holds(monkeypatch):
     gripper.disconnect()
     time.sleep(1.0)
     assert ask(host, "state")["finger"] > 0.6
+
+
+@pytest.mark.parametrize("modbus", [False, True])
+def test_a_measurement_is_not_too_old_while_the_settings_are_written(
+  modbus, monkeypatch
+):
+  """It counts messages, because doubles answer sooner than the real line."""
+  if modbus:
+    pytest.importorskip("pymodbus", reason="needs pymodbus")
+  kind = buses.Modbus if modbus else buses.Dynamixel
+  with bench(gripper=35074, modbus=modbus) as (_, port):
+    line = kind(port, driver.BAUD, 1)
+    line.write(11, bytes([3]))  # Another mode than the driver's.
+    line.close()
+    with held(port) as gripper:
+      told, send = [], kind._try
+
+      def count(*args, **named):
+        told.append(gripper.get_observation().time)
+        return send(*args, **named)
+
+      monkeypatch.setattr(kind, "_try", count)
+      gripper.send_action(False)
+      settle(gripper, 0.0)
+  messages = max(told.count(time) for time in set(told))
+  age = driver._PERIOD + (messages + 0.5) * ANSWER_S
+  assert messages > 5 and age < Limits.gripper_age
 
 
 def test_the_gap_closes_at_the_speed_of_the_training():
@@ -285,6 +317,36 @@ def test_a_port_without_a_gripper_is_one_line(echo):
   assert time.monotonic() - begin < 3
   assert "\n" not in str(error.value)
   os.close(theirs)
+
+
+def test_a_refusal_by_modbus_closes_the_port():
+  pytest.importorskip("pymodbus", reason="needs pymodbus")
+  ours, theirs = os.openpty()
+  tty.setraw(theirs)
+  port = os.ttyname(theirs)
+
+  def refuse() -> None:
+    with contextlib.suppress(OSError):
+      while data := os.read(ours, 100):
+        if data.startswith(b"\x01\x03"):  # Not a packet of Dynamixel.
+          os.write(ours, reply + modbus_crc(reply).to_bytes(2, "little"))
+
+  reply = b"\x01\x83\x02"  # Illegal data address.
+  threading.Thread(target=refuse, daemon=True).start()
+  before = len(opened(port))
+  with pytest.raises(DeviceError, match="it refuses register 0") as error:
+    driver.connect(port)
+  assert len(opened(port)) == before == 1, error  # Whose frames keep the bus.
+  os.close(theirs)
+
+
+def opened(port: str) -> list[Path]:
+  """Returns the descriptors of this process that are open on a port."""
+  found = []
+  for link in Path("/proc/self/fd").iterdir():
+    with contextlib.suppress(OSError):
+      found += [link] * (os.readlink(link) == port)
+  return found
 
 
 def test_a_missing_port_or_package_is_one_line(monkeypatch):
