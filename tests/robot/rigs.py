@@ -5,7 +5,7 @@ A clock that the test turns makes it exact, and faster than time.
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 import contextlib
 import dataclasses
 import math
@@ -57,14 +57,14 @@ class Arm(simulated.SimulatedArm):
   waits = staticmethod(lambda: None)
   """What happens until it is at rest."""
 
-  def __init__(self, name: str, clock: Clock):
+  def __init__(self, name: str, wait: Callable[[float], None]):
     super().__init__(name)
-    self.zeros, self._clock = 0, clock
+    self.zeros, self._wait = 0, wait
 
   def start(self, *, zero: bool = True) -> None:
     super().start(zero=zero)
     self.zeros += zero
-    self._clock.sleep(0.01)  # The real one waits.
+    self._wait(0.01)  # As the real one, for measurements with the new zero.
 
   def stop(self) -> None:
     super().stop()
@@ -104,7 +104,7 @@ class Rig:
     self.plant = Plant(task.scene.model, seed=seed)
     self.simulation = Simulation(plant_board, self.plant, Scene(task, seed=seed))
     self.simulation.publish(self.now)
-    self.arm = Arm(plant_board.name, self.clock)
+    self.arm = Arm(plant_board.name, self.step)
     self.gripper = Gripper(plant_board.name)
     for device in (self.arm, self.gripper):
       device.connect()
