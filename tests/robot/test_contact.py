@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from rigs import NEUTRAL
 
 from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.contact import FILTER_S, stiffness_limit
@@ -12,7 +13,6 @@ from apnpql_jax.robot.sensor import FREE_FORCE, load
 from apnpql_jax.robot.virtual_arm import Admittance, VirtualArm, ramp
 from apnpql_jax.sim.motors import VELOCITY_GAIN
 
-NEUTRAL = np.array([-1.8957, -1.7712, 1.9888, -1.7884, -1.5708, -0.3249])
 MODEL = ArmModel()
 UP = np.array([0.0, 0.0, 1.0])
 STILL = MODEL.dynamics(NEUTRAL, np.zeros(6))

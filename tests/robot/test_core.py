@@ -8,6 +8,7 @@ import dataclasses
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
+from rigs import NEUTRAL
 
 from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.core import HOME_SPEED, Command, Core
@@ -16,7 +17,6 @@ from apnpql_jax.robot.protocols import ArmState, GripperState
 from apnpql_jax.robot.supervisor import JAM_S, Action, Mode
 from apnpql_jax.robot.virtual_arm import LEAD, Admittance, VirtualArm
 
-NEUTRAL = np.array([-1.8957, -1.7712, 1.9888, -1.7884, -1.5708, -0.3249])
 MODEL = ArmModel()
 LIMITS = Limits(
   box=np.array([[0.2, 0.8], [-0.5, 0.5], [0.0, 0.6]]),

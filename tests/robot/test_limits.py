@@ -5,11 +5,11 @@ from __future__ import annotations
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
+from rigs import NEUTRAL
 
 from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.limits import BRAKING, MARGIN, TIMESTEP, Limits, MotionLimiter
 
-NEUTRAL = np.array([-1.8957, -1.7712, 1.9888, -1.7884, -1.5708, -0.3249])
 MODEL = ArmModel()
 BOX = np.array([[0.35, 0.5], [-0.1, 0.1], [0.2, 0.3]])
 TINY = 1e-9

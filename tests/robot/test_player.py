@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
 import contextlib
-import dataclasses
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rigs import START, TurnedClock
 
 from apnpql_jax.data import lerobot
 from apnpql_jax.errors import DeviceError
@@ -35,19 +35,6 @@ CONTRACT: dict[str, Any] = {
   "action": {"order": [*JOINTS, "gripper"]},
   "cameras": {x: {"height": 24, "width": 32} for x in ("global", "wrist")},
 }
-
-
-@dataclasses.dataclass(frozen=True)
-class PassingClock(Clock):
-  """Time that passes only in ``sleep``."""
-
-  passed: list[float] = dataclasses.field(default_factory=lambda: [50.0])
-
-  def now(self) -> float:
-    return self.passed[0]
-
-  def sleep(self, seconds: float) -> None:
-    self.passed[0] += max(seconds, 0.0)
 
 
 class Camera:
@@ -83,18 +70,19 @@ class Episode:
     kind: type[Camera] = Camera,
   ):
     """``thinks``: time in s that the policy takes for an action, by its number."""
-    self.board, self.clock, self.times = board, PassingClock(), []
+    self.board, self.clock, self.times = board, TurnedClock(), []
 
     def act(seen: Any, episode: int, instant: int) -> np.ndarray:
       self.clock.sleep(thinks(instant))
-      self.times.append(self.clock.now() - 50.0)
+      self.times.append(self.clock.now() - START)
       return np.full(7, 0.25, np.float32)
 
     robot = Robot("double", CONTRACT, Cell(), self.clock)
     cameras: Any = [kind(self.clock, 1000), Camera(self.clock, frames)]
     self.player = Player(robot, board, cameras, act, recorder)
-    state = {"number": 1, "phase": Phase.PLAY, "time": 49.998, "gripper_time": 49.98}
+    state = {"number": 1, "phase": Phase.PLAY, "time": START - 0.002}
     board["order"].write({"number": 1, "phase": Phase.PLAY})
+    state["gripper_time"] = START - 0.02
     board["state"].write({**state, "position": np.arange(6.0), "gripper": 0.5})
 
   def play(self) -> None:

@@ -18,6 +18,7 @@ import time
 from typing import Any
 
 import numpy as np
+from rigs import NEUTRAL
 
 from apnpql_jax.robot import control_process, simulated, simulation
 from apnpql_jax.robot.board import Board, Phase, text
@@ -26,7 +27,6 @@ from apnpql_jax.robot.clock import Clock
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.supervisor import Mode
 
-NEUTRAL = np.array([-1.8957, -1.7712, 1.9888, -1.7884, -1.5708, -0.3249])
 CONTRACT: dict[str, Any] = {
   "task": "push_plate",
   "control_period_s": 0.15,

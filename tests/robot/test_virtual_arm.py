@@ -5,6 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
+from rigs import NEUTRAL
 
 from apnpql_jax.config.files import mjcf_path
 from apnpql_jax.robot.limits import DEVIATION
@@ -12,7 +13,6 @@ from apnpql_jax.robot.sensor import FORCE_ACCURACY, TORQUE_ACCURACY, Sensor, loa
 from apnpql_jax.robot.virtual_arm import Admittance, VirtualArm, ramp
 from apnpql_jax.sim import motors
 
-NEUTRAL = np.array([-1.8957, -1.7712, 1.9888, -1.7884, -1.5708, -0.3249])
 PERIODS = 20
 
 

@@ -3,90 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Generator
+from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
+import rigs
+from rigs import NEUTRAL
 
-from apnpql_jax.config.files import mjcf_path
 from apnpql_jax.robot.board import Board, Phase
-from apnpql_jax.robot.cell import Cell
-from apnpql_jax.robot.clock import Clock
-from apnpql_jax.robot.control import Control
-from apnpql_jax.robot.core import Core
-from apnpql_jax.robot.hand import Hand
 from apnpql_jax.robot.limits import TIMESTEP
-from apnpql_jax.robot.plant import Plant
-from apnpql_jax.robot.protocols import ArmState, GripperState
 from apnpql_jax.robot.sensor import load
 from apnpql_jax.robot.supervisor import Mode
 
-NEUTRAL = np.array([-1.8957, -1.7712, 1.9888, -1.7884, -1.5708, -0.3249])
-CONTRACT = {"control_period_s": 0.15, "joints": {"ranges": [[-6.28, 6.28]] * 7}}
 AWAY = np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0])
 PRESS = np.array([0.0, 0.0, 20.0])  # N, upwards
 
 
-class Device:
-  """The arm or the gripper of a plant in this process."""
+class Rig(rigs.Rig):
+  """A rig that begins near the neutral pose, and on which something may press."""
 
-  time = 100.0
-
-  def __init__(self, plant: Plant):
-    self.plant, self.target, self.zeros = plant, None, 0
-
-  def connect(self) -> None: ...
-
-  def disconnect(self) -> None: ...
-
-  def describe(self) -> dict:
-    return {}
-
-
-class PlantArm(Device):
-  """An arm that moves by a cycle with each measurement."""
-
-  def get_observation(self) -> ArmState:
-    Device.time += TIMESTEP
-    self.plant.step(self.target, True)
-    return self.plant.arm_state(self.time)
-
-  def send_action(self, position: np.ndarray) -> None:
-    self.target = position
-
-  def start(self, *, zero: bool = True) -> None:
-    if zero:
-      self.zeros += 1
-      self.plant.zero_force()
-
-  def stop(self) -> None:
-    self.target = None
-
-
-class PlantGripper(Device):
-  """Its fingers stay closed."""
-
-  def get_observation(self) -> GripperState:
-    return GripperState(self.time, self.plant.gripper_angle)
-
-  def send_action(self, close: bool) -> None: ...
-
-  def hold(self) -> None: ...
-
-
-class Rig:
-  """The controller of the runtime in lockstep with a plant."""
-
-  def __init__(self, board: Board, seed: int):
-    model = mujoco.MjModel.from_xml_path(str(mjcf_path("push_plate")))
-    self.plant, self.board = Plant(model, seed=seed), board
+  def __init__(self, *boards: Board, seed: int):
+    super().__init__(*boards, seed=seed)
     self.plant.put_arm(NEUTRAL + AWAY)
-    self.hand = model.body("gripper").id
-    self.arm = PlantArm(self.plant)
-    core = Core(Cell().limits(CONTRACT))
-    hand = Hand(PlantGripper(self.plant), open_rad=0.0, closed_rad=1.1)
-    self.control = Control(self.arm, hand, core, board, clock=Turned())
-    self.number = 0
+    self.hand = self.plant.model.body("gripper").id
 
   def press(self, force: np.ndarray | float) -> None:
     """Presses on the hand with N in the world."""
@@ -94,34 +33,21 @@ class Rig:
     self.idle()
 
   def idle(self, seconds: float = 0.2) -> None:
-    for _ in range(round(seconds / TIMESTEP)):
-      self.control.cycle()
+    self.run(seconds)
 
-  def order(self, phase: Phase, *, seconds: float = 3.0):
+  def order(self, phase: Phase, *, seconds: float = 3.0, **fields: Any) -> Any:
     """Gives an order, and returns the state when it is done, or after some time."""
-    self.number += 1
-    self.board["order"].write(
-      {"number": self.number, "phase": phase, "target": NEUTRAL, "close": 1}
-    )
+    super().order(phase, target=NEUTRAL, close=1, **fields)
     for _ in range(round(seconds / TIMESTEP)):
-      self.control.cycle()
-      state = self.board["state"].read()
-      if state["done"]:
+      self.turn()
+      if self.state["done"]:
         break
-    return state
-
-
-class Turned(Clock):
-  """Stands still between two cycles."""
-
-  def now(self) -> float:
-    return Device.time
+    return self.state
 
 
 @pytest.fixture(params=range(3))
 def rig(request) -> Generator[Rig]:
-  with Board() as board:
-    found = Rig(board, request.param)
+  with Rig.opened(seed=request.param) as found:
     yield found
     found.control.close()
 
@@ -157,9 +83,9 @@ def test_the_check_forgets_readings_from_before_the_first_zero(rig):
   rig.plant.put_arm(NEUTRAL)
   rig.idle()
   assert load(rig.plant.arm_state(0.0).wrench) > 1  # Not zeroed yet.
-  begin = Device.time
+  begin = rig.now
   assert rig.order(Phase.HOME)["done"]
-  assert Device.time - begin < 0.05
+  assert rig.now - begin < 0.05
   assert rig.order(Phase.PLAY, seconds=0.1)["mode"] == Mode.HOLD
 
 
@@ -169,7 +95,7 @@ def test_a_hand_that_something_presses_on_is_not_zeroed_and_does_not_move(rig):
   zeros, before = rig.arm.zeros, rig.plant.arm_state(0.0).position
   assert is_refused(rig.order(Phase.PLAY))
   rig.idle()
-  assert rig.arm.zeros == zeros and rig.arm.target is None
+  assert rig.arm.zeros == zeros and not rig.servo["follow"]
   np.testing.assert_allclose(rig.plant.arm_state(0.0).position, before, atol=1e-3)
   rig.press(0.0)
   assert rig.order(Phase.PLAY, seconds=0.1)["mode"] == Mode.HOLD
