@@ -138,7 +138,7 @@ def _report(episode: int, episodes: int, outcome: Outcome) -> None:
     mode == "hold" and reason != NO_ACTION for _, mode, reason in outcome.events
   )
   counts = {"missed periods": outcome.missed_periods, "late cycles": outcome.overruns}
-  late = "".join(f", {n} {name}" for name, n in counts.items() if n)
+  late = "".join(f", {name}: {n}" for name, n in counts.items() if n)
   print_line(
     f"episode {episode + 1} of {episodes}: {outcome.reason}, {outcome.seconds:.1f} s, "
     f"{outcome.actions} actions, {holds} holds{late}"

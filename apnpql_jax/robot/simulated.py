@@ -23,6 +23,9 @@ from apnpql_jax.robot.simulation import CLOSE, HOLD, OPEN, RECORDS, main
 _START_S = 120.0
 """Time that the plant may take to start, s; a busy machine imports slowly."""
 
+_ZERO_S = 10.0
+"""Time that the plant may take to zero its sensor, s."""
+
 
 class _OnBoard:
   """A device whose measurements and commands are on the plant's board."""
@@ -72,11 +75,15 @@ class SimulatedArm(_OnBoard):
 
   def start(self, *, zero: bool = True) -> None:
     """See ``Arm.start``."""
-    position = self.get_observation().position
+    board, position = _opened(self._board), self.get_observation().position
     self._zeroed += zero
-    _opened(self._board)["servo"].write(
-      {"follow": 1, "target": position, "zero": self._zeroed}
-    )
+    board["servo"].write({"follow": 1, "target": position, "zero": self._zeroed})
+    if not self._comes_true(lambda: self._zeroed == board["plant"].read()["zeroed"]):
+      raise DeviceError("simulated arm: it does not zero its sensor")
+
+  def _comes_true(self, condition: Callable[[], bool]) -> bool:
+    """Waits for the plant, whose measurements have the old zero until then."""
+    return comes_true(condition, _ZERO_S)
 
 
 class SimulatedGripper(_OnBoard):

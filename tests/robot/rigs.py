@@ -64,7 +64,10 @@ class Arm(simulated.SimulatedArm):
   def start(self, *, zero: bool = True) -> None:
     super().start(zero=zero)
     self.zeros += zero
-    self._wait(0.01)  # As the real one, for measurements with the new zero.
+
+  def _comes_true(self, condition: Callable[[], bool]) -> bool:
+    self._wait(0.01)
+    return condition()
 
   def stop(self) -> None:
     super().stop()
