@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_replay import CONTRACT
+from test_replayed_logs import CONTRACT
 
 from apnpql_jax.errors import DeviceError, FileError, RunStopped
 from apnpql_jax.robot import run

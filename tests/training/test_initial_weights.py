@@ -130,7 +130,7 @@ def test_an_origin_that_is_not_there_is_refused(run, origin, words):
 
 
 def test_settings_of_weights_are_all_that_change_their_shapes():
-  base = dataclasses.replace(testing.SMALL, residual_blocks=1)
+  base = dataclasses.replace(testing.SMALL, residual_blocks=1, gripper_offset=True)
 
   def kinds(config: AgentConfig, env: EnvConfig = PIXELS.env) -> Any:
     whole = dataclasses.replace(PIXELS, agent=config, env=env)
