@@ -41,7 +41,7 @@ MIN_DISTANCE = 0.16  # m between cup and goal: the mark clears the widest cup
 # 0.06 N m, of the 0.14 N m that the limit of acceleration leaves it.
 MASS = 0.025
 STANDOFF = 0.09  # m; this far behind the cup the open fingers are clear of it
-LIFT = 0.07  # m; carrying height: turning cup and fingers reach down 100 mm
+LIFT = 0.1  # m; carrying height: turning cup and fingers reach down 100 mm
 FREE = 0.06  # m; from this height on the cup is turned and moved at full speed
 GOAL_TOLERANCE = 0.03  # m between the centers of cup and goal
 UPRIGHT = 0.97  # cosine of the largest tilt of a cup that stands: 14 degrees
