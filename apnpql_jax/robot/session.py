@@ -26,9 +26,6 @@ START_S = 600.0
 HOME_S = 60.0
 """Time of the session that the way to the neutral pose may take."""
 
-END_S = policy_process.END_S
-"""Time that the policy process may take to write an episode, s."""
-
 UNKNOWN = "the arm's controller holds; its state is unknown"
 
 
@@ -50,7 +47,6 @@ class Session(contextlib.AbstractContextManager):
     self._signals = signals
     self._robot, self._policy, self._options = robot, policy, options
     self._clock = robot.clock
-    self._judged = robot.can_judge
     self._scene = 0
     self._events: list[tuple[float, str, str]] = []
     self._failure, self._moved = "", False
@@ -127,7 +123,7 @@ class Session(contextlib.AbstractContextManager):
     policy = self._ended(number)
     self._take_events()
     solved = bool(policy["solved"])
-    judged = self._judged and whole and policy["actions"]
+    judged = self._robot.can_judge and whole and policy["actions"]
     return Outcome(
       solved=solved if judged else None,
       reason=reason or (SOLVED if solved else TIME_LIMIT),
@@ -168,7 +164,7 @@ class Session(contextlib.AbstractContextManager):
         known = not self.processes.is_alive("control")
         at_rest = known and self.board["state"].read()["at_rest"]
         self.rest = "the arm is at rest" if at_rest else UNKNOWN
-      self.processes.end(0.0, END_S)
+      self.processes.end(0.0, policy_process.END_S)
       self.processes = None
     self._stack.close()
 
@@ -263,7 +259,7 @@ class Session(contextlib.AbstractContextManager):
       begun = found["order"] == number and self._running.is_alive("policy")
       return not begun or found["ended"] == number
 
-    if not comes_true(written, END_S):
+    if not comes_true(written, policy_process.END_S):
       self._failure = self._failure or "policy: it does not end its episode"
     found = self.board["policy"].read()
     if found["order"] == number:

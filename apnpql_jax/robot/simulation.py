@@ -138,13 +138,10 @@ class Simulation:
     return not order["quit"]
 
   def step(self) -> None:
-    """Advances by 2 ms, as arm and gripper are told."""
-    servo, grip = (
-      self._board["servo"].read(),
-      int(self._board["grip"].read()["command"]),
-    )
+    """Advances by 2 ms under the present commands to arm and gripper."""
+    servo, grip = self._board["servo"].read(), self._board["grip"].read()["command"]
     target = servo["target"] if servo["follow"] else None
-    self._plant.step(target, None if grip == HOLD else grip == CLOSE)
+    self._plant.step(target, None if grip == HOLD else bool(grip == CLOSE))
 
   def publish(self, now: float) -> None:
     """Writes the state of the plant."""

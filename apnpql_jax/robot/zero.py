@@ -1,7 +1,7 @@
 """When the force sensor may be zeroed: only while nothing presses on the hand.
 
 Zeroing makes a sensor report no force, so it hides whatever presses on the hand at that
-moment. A controller does not tell how large the force was. So:
+moment. A controller does not report how large the force was. So:
 
 - Before the first motion of a session the sensor is zeroed whatever it reads, because
   its offset since power-on is not known.

@@ -13,6 +13,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from comparison import TASKS
 import jax
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
@@ -25,7 +26,6 @@ from apnpql_jax.training.evaluate import figures_of, held_out_batches
 from apnpql_jax.training.rollout import WorldPolicy, make_player
 from apnpql_jax.types import NUM_PRIMITIVES, Array
 
-TASKS = ("push_plate", "stack_box", "flip_cup", "place_plate")
 EPISODES, BANK_SEED = 512, 1
 HELD = 10
 """Control periods for which a choice is kept."""

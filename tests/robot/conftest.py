@@ -1,6 +1,8 @@
-"""Doubles answer late on a busy machine, which is not what most tests are about."""
+"""What the tests of the runtime share: a policy, and patience with the doubles."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import pytest
 
@@ -9,6 +11,19 @@ from apnpql_jax.robot.drivers import buses
 
 @pytest.fixture(autouse=True)
 def patience(request, monkeypatch) -> None:
-  """Lets the driver of the gripper wait longer, unless a test is about its silence."""
+  """Lets the driver of the gripper wait longer, unless a test is about its silence.
+
+  On a busy machine doubles answer late, which is not what most tests are about.
+  """
   if "silent" not in request.node.name:
     monkeypatch.setattr(buses, "ATTEMPTS", 20)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory) -> Path:
+  """Returns the folder of an untrained policy."""
+  from apnpql_jax.testing import export_untrained  # Imports JAX.
+
+  folder = tmp_path_factory.mktemp("policies") / "policy"
+  export_untrained(folder)
+  return folder

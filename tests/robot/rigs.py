@@ -176,7 +176,7 @@ class Rig:
 
   @property
   def servo(self) -> Any:
-    """What the arm is told: the record "servo"."""
+    """The command to the arm: the record "servo"."""
     return self._plant_board["servo"].read()
 
   @property

@@ -16,18 +16,10 @@ from apnpql_jax.deploy.export import VERSION
 from apnpql_jax.errors import ConfigError, DeviceError, FileError
 from apnpql_jax.robot import cell, devices, policy_folder
 from apnpql_jax.robot.limits import MotionLimiter
-from apnpql_jax.testing import ROOT, export_untrained
+from apnpql_jax.testing import ROOT
 
 CENTER = np.array([0.5, 0.0, 0.2])
 """A place inside of the workspace of the example."""
-
-
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory) -> Path:
-  """Returns the folder of an untrained policy."""
-  folder = tmp_path_factory.mktemp("policies") / "policy"
-  export_untrained(folder)
-  return folder
 
 
 @pytest.fixture

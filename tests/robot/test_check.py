@@ -40,17 +40,8 @@ from apnpql_jax.robot.drivers import realsense
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.protocols import ArmState, Frame, GripperState
 from apnpql_jax.robot.supervisor import CAMERAS
-from apnpql_jax.testing import export_untrained
 
 OPEN_CAMERAS = devices.open_cameras
-
-
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory) -> Path:
-  """Returns the folder of an untrained policy."""
-  folder = tmp_path_factory.mktemp("policies") / "policy"
-  export_untrained(folder)
-  return folder
 
 
 @dataclasses.dataclass

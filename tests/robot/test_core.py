@@ -367,7 +367,7 @@ class Anything:
     self._way, self._wrench = np.zeros(6), np.zeros(6)
 
   def action(self) -> np.ndarray:
-    """Returns an action f64[7]; it often goes on in the same direction."""
+    """Returns an action f64[7]; it often keeps its direction."""
     rng = self._rng
     if rng.random() < 0.1:
       self._way = rng.choice([-1, 1], 6) * rng.choice([0.3, 1.0], 6)
