@@ -20,7 +20,7 @@ import pixel_comparison
 from scipy.stats import qmc
 import state_comparison
 
-TRIALS = 4
+TRIALS = 2
 
 _COMMON = {"min-alpha": (0.001, 0.01), "learning-rate-e": (3e-4, 1e-3)}
 _MPO = {"epsilon": (0.5, 3.0), "policy-max-std": (0.1, 1.0)}
