@@ -10,6 +10,7 @@ from apnpql_jax.agents.columns.candidates import (
   Candidates,
   all_on_the_highest,
   score,
+  with_either_gripper,
 )
 from apnpql_jax.agents.networks import Heads
 from apnpql_jax.agents.table_one import Algorithm
@@ -89,11 +90,7 @@ def _means(heads: Heads, drawn: Candidates) -> Candidates:
   base = drawn.base
   if not isinstance(base, GripperGMM):
     return drawn.replace(weights=all_on_the_highest(drawn.weights))
-  arm = jnp.moveaxis(base.loc, -2, 0)
-  open_hand = jnp.zeros((*arm.shape[:-1], 1))
-  samples = jnp.concatenate(
-    [jnp.concatenate([arm, open_hand + gripper], axis=-1) for gripper in (0.0, 1.0)]
-  )
+  samples = with_either_gripper(jnp.moveaxis(base.loc, -2, 0))
   actions, outputs, q_values = score(heads, samples)
   weights = all_on_the_highest(base.log_prob(samples) + drawn.tilt * q_values)
   return Candidates(samples, actions, outputs, q_values, weights, base, drawn.tilt)

@@ -24,13 +24,15 @@ class MLP(nn.Module):
 
   hidden: Sequence[int]
   out: int
+  bias_init: nn.initializers.Initializer = nn.initializers.zeros  # of the last layer
 
   @nn.compact
   def __call__(self, x: Float[Array, "*b n"]) -> Float[Array, "*b out"]:
     """Applies the layers."""
     for width in self.hidden:
       x = nn.relu(nn.Dense(width)(x))
-    return nn.Dense(self.out, kernel_init=_small, name="out")(x)
+    last = nn.Dense(self.out, kernel_init=_small, bias_init=self.bias_init, name="out")
+    return last(x)
 
 
 class PositionwiseDense(nn.Module):

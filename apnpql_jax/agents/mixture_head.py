@@ -5,11 +5,15 @@ from __future__ import annotations
 import functools
 import math
 
+from flax import linen as nn
 import jax
 import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
 
 from apnpql_jax.dists.gmm import GripperGMM
 from apnpql_jax.types import ARM_DOF, Array
+
+_SPREAD = 0.3  # rad/s; deviation of each joint's first mean between components
 
 
 def mixture_from_outputs(
@@ -73,6 +77,22 @@ def _scale_tril(log_std: Array, below: Array) -> Array:
 def mixture_size(*, own_mean: bool) -> int:
   """Counts outputs per component: own mean, Cholesky factor, weight and gripper."""
   return ARM_DOF * own_mean + ARM_DOF * (ARM_DOF + 1) // 2 + 2
+
+
+def spread_means(num: int) -> nn.initializers.Initializer:
+  """Returns the first bias of a head with own means, which starts several apart.
+
+  Components that start together have equal gradients, and only noise would part them.
+  """
+
+  def init(key: PRNGKeyArray, shape: tuple[int, ...], dtype: jnp.dtype) -> Array:
+    bias = jnp.zeros((num, shape[0] // num), dtype)
+    if num > 1:
+      means = _SPREAD * jax.random.normal(key, (num, ARM_DOF), dtype)
+      bias = bias.at[:, :ARM_DOF].set(means)
+    return bias.reshape(shape)
+
+  return init
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1, 2))

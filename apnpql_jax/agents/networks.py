@@ -19,7 +19,11 @@ from jaxtyping import Float, PRNGKeyArray
 
 from apnpql_jax.agents.encoder import Encoder
 from apnpql_jax.agents.layers import MLP, PRODUCTS, Constant
-from apnpql_jax.agents.mixture_head import mixture_from_outputs, mixture_size
+from apnpql_jax.agents.mixture_head import (
+  mixture_from_outputs,
+  mixture_size,
+  spread_means,
+)
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.dists.gmm import GripperGMM
 from apnpql_jax.types import ACTION_DIM, NUM_PRIMITIVES, Array, Observation
@@ -70,13 +74,14 @@ def make_networks(
   ``value_head`` and ``value`` are those of the policy evaluation.
   """
   hidden, learned_mean = config.hidden, config.prior_mean == "learned"
+  own = config.policy_components
   modules = {
     "encoder": Encoder(config),
     "ap": MLP(hidden, NUM_PRIMITIVES * ACTION_DIM),
     "bp": MLP(hidden, NUM_PRIMITIVES * mixture_size(own_mean=learned_mean)),
     "z": value_head,
     "alpha": Constant() if config.temperature == "shared" else MLP(hidden, 1),
-    "policy": MLP(hidden, mixture_size(own_mean=True)),
+    "policy": MLP(hidden, own * mixture_size(own_mean=True), spread_means(own)),
   }
   return Networks({k: modules[k] for k in groups}, value, config)
 
@@ -138,11 +143,11 @@ class Heads:
     )
 
   def policy(self) -> GripperGMM:
-    """Returns the policy pi_psi, one component, not squashed; trains only its group."""
+    """Returns the policy pi_psi, a mixture, not squashed; trains only its group."""
     return mixture_from_outputs(
       self._apply("policy", jax.lax.stop_gradient(self.phi)),
       None,
-      num=1,
+      num=self.config.policy_components,
       min_std=self.config.policy_min_std,
       initial_std=self.config.policy_initial_std,
       max_std=self.config.policy_max_std,

@@ -38,7 +38,7 @@ _POSITIVE = (
   "env.worlds env.time_limit_s env.control_period_s "
   "agent.n_step agent.learning_rate_e agent.epsilon "
   "agent.feature_dim agent.max_grad_norm agent.patch_channels agent.conv_channels "
-  "agent.ap_delta agent.min_std agent.policy_min_std "
+  "agent.ap_delta agent.min_std agent.policy_min_std agent.policy_components "
   "agent.initial_alpha agent.min_alpha "
   "replay.capacity replay.batch_size total_steps rollout_length "
   "updates_per_iteration eval_every eval_episodes checkpoint_every keep_checkpoints "
@@ -155,7 +155,15 @@ def check_agent(
       "without agent.primitive_gripper, only the M-step can learn when to close; set "
       "agent.gripper_offset"
     )
-  for name, components in (("min_prob", 3), ("policy_min_prob", 2)):
+  own = agent.policy_components
+  for name in ("policy_samples", "target_samples"):
+    if getattr(agent, name) < 2 * own:
+      raise ConfigError(
+        f"agent.{name}={getattr(agent, name)} holds no draw of each of "
+        f"agent.policy_components={own} with both gripper commands; use at least "
+        f"{2 * own}"
+      )
+  for name, components in (("min_prob", 3), ("policy_min_prob", max(own, 2))):
     if not 0.0 < (prob := getattr(agent, name)) < 1.0 / components:
       raise ConfigError(f"agent.{name}={prob} must be within (0, 1/{components})")
   if agent.v_min >= agent.v_max:

@@ -219,7 +219,12 @@ class AgentConfig:
   """Upper bound of each joint's standard deviation in the parametric policy (rad/s)."""
 
   policy_min_prob: float = 0.001
-  """Lower bound of gripper probabilities in the parametric policy."""
+  """Lower bound of gripper probabilities in the parametric policy and, within a factor
+  of 2, of its component weights."""
+
+  policy_components: int = codec.added(1)
+  """Gaussian components of the parametric policy, one in the paper; their means start
+  apart."""
 
   min_prob: float = 0.05
   """Lower bound of gripper probabilities in the prior and, within a factor of 2, of

@@ -66,6 +66,16 @@ class GripperGMM(ActionDistribution):
     gripper = (uniform[1] < probability).astype(dtype)
     return jnp.moveaxis(jnp.concatenate([arm, gripper[..., None]], axis=-1), -2, 0)
 
+  def sample_each(self, key: PRNGKeyArray, n: int) -> Float[Array, "n k *b d"]:
+    """Draws the continuous part n times from every component.
+
+    One component draws what ``sample`` draws with the same key.
+    """
+    shape = (*self.loc.shape[:-1], n, self.loc.shape[-1])
+    noise = jax.random.normal(jax.random.split(key)[0], shape, self.loc.dtype)
+    arm = jnp.einsum("...kij,...ksj->...ski", self.scale_tril, noise)
+    return jnp.moveaxis(arm + self.loc[..., None, :, :], (-3, -2), (0, 1))
+
   def log_prob(self, value: Float[Array, "*sb d+1"]) -> Float[Array, "*sb"]:
     """Returns the log density of unclipped actions."""
     total = jax.nn.logsumexp(self._log_joint(value), axis=-2)

@@ -2,6 +2,8 @@
 
   python experiments/results/pixel_comparison.py --jobs 2              # days
   python experiments/results/pixel_comparison.py --tasks push_plate --seeds 0
+  python experiments/results/pixel_comparison.py --tasks push_plate --seeds 0 \
+      --rows ap_mpo_mixture ap_sac_mixture
 
 See ``comparison``. A row has the preset of the task, with its environment steps,
 updates and candidates. Settings of the rows are those that a search from states found
@@ -16,6 +18,12 @@ from comparison import PAPER, Comparison, Row
 import state_comparison
 
 ROWS = {name: state_comparison.ROWS[name] for name in PAPER}
+# What a parametric policy costs: its projection, or that it is a single Gaussian? Here
+# it has as many components as the prior.
+ROWS |= {
+  f"{name}_mixture": Row(name, f"{ROWS[name].flags} --agent.policy-components 3")
+  for name in ("ap_mpo", "ap_sac")
+}
 
 EVAL_EVERY = {
   "push_plate": 2_560,

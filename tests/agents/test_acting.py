@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 from apnpql_jax.agents.acting import choose_action
 from apnpql_jax.agents.columns.policy import parametric
@@ -65,14 +66,16 @@ def log_density(heads: Heads, name: str, actions: np.ndarray) -> np.ndarray:
   return base + np.asarray(heads.q(jnp.clip(actions, -1.0, 1.0)) / heads.alpha())
 
 
-@pytest.mark.parametrize("name", ["ap_npql", "ap_mpo", NO_MEANS])
-def test_mean_takes_the_likeliest_mean(name: str):
-  heads, actions, _ = play(name, "mean")
+@pytest.mark.parametrize(
+  ("name", "components"), [("ap_npql", 1), ("ap_mpo", 1), ("ap_mpo", 3), (NO_MEANS, 1)]
+)
+def test_mean_takes_the_likeliest_mean(name: str, components: int):
+  heads, actions, _ = play(name, "mean", policy_components=components)
   points = means(heads.policy() if name != "ap_npql" else heads.prior())
   best = log_density(heads, name, points).argmax(0)
   expected = np.clip(points[best, np.arange(STATES)], -1.0, 1.0)
   np.testing.assert_allclose(actions, np.broadcast_to(expected, actions.shape), 1e-5)
-  if name == "ap_npql":
+  if name == "ap_npql" or components > 1:
     assert len(np.unique(best)) > 1  # Else the choice would not be tested.
 
 
@@ -103,6 +106,25 @@ def test_prior_draws_from_b_whatever_q_is():
   closed = jnp.sum(weight * jax.nn.sigmoid(prior.gripper_logits), axis=-1)
   error = actions[..., 6].mean(0) - np.asarray(closed)
   assert np.abs(error).max() < 4.0 * 0.5 / np.sqrt(KEYS)
+
+
+def test_policy_draws_from_every_component_by_its_weight():
+  """Each action is that of one stratum; the gripper follows the mixture's density."""
+  heads, actions, _ = play("ap_mpo", "policy", policy_components=3)
+  policy = heads.policy()
+  weight = jax.nn.softmax(policy.logits)
+  for share, found in (
+    (jax.nn.sigmoid(policy.gripper_logits), actions[..., 6]),
+    (_below(policy), actions[..., 0] < 0.0),
+  ):
+    error = found.mean(0) - np.asarray(jnp.sum(weight * share, axis=-1))
+    assert np.abs(error).max() < 4.0 * 0.5 / np.sqrt(KEYS)
+    assert np.ptp(share, axis=-1).max() > 0.2  # Else one component would do.
+
+
+def _below(mixture) -> np.ndarray:
+  """Returns each component's probability of a negative first velocity."""
+  return stats.norm.cdf(0.0, mixture.loc[..., 0], mixture.scale_tril[..., 0, 0])
 
 
 def test_an_unknown_rule_is_rejected():

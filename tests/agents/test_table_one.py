@@ -17,6 +17,7 @@ from scipy import special
 from apnpql_jax.agents import table_one
 from apnpql_jax.agents.columns import regularizer
 from apnpql_jax.agents.columns.candidates import clip_action
+from apnpql_jax.agents.columns.policy import parametric
 from apnpql_jax.agents.learner import Agent, bellman_target, make_agent, total_loss
 from apnpql_jax.agents.networks import Heads
 from apnpql_jax.agents.table_one import ALGORITHMS, algorithm_of
@@ -85,9 +86,9 @@ class Example(NamedTuple):
 
 
 @functools.cache
-def example_of(name: str) -> Example:
+def example_of(name: str, components: int = 1) -> Example:
   """Parameters far from their first values, where no two candidates are alike."""
-  config = dataclasses.replace(SMALL, algorithm=name)
+  config = dataclasses.replace(SMALL, algorithm=name, policy_components=components)
   agent, row = make_agent(config), algorithm_of(config)
   batch = random_batch(1, BATCH, windows=config.n_step)
   rng = np.random.default_rng(0)
@@ -120,9 +121,17 @@ def touched(slope: dict) -> set[str]:
   return {k for k, g in slope.items() if any(np.any(x) for x in jax.tree.leaves(g))}
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
-def test_each_loss_trains_exactly_the_parameters_the_paper_names(name: str):
-  example = example_of(name)
+@pytest.mark.parametrize(
+  ("name", "components"),
+  [
+    *((name, 1) for name in ALGORITHMS),
+    *((name, 2) for name, row in ALGORITHMS.items() if row.policy is parametric),
+  ],
+)
+def test_each_loss_trains_exactly_the_parameters_the_paper_names(
+  name: str, components: int
+):
+  example = example_of(name, components)
   slopes, (total, metrics) = example.learn(example.batch)
   assert {k: touched(slope) for k, slope in slopes.items()} == TRAINS[name]
   # What is trained is what there is.

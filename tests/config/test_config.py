@@ -39,6 +39,7 @@ ADDED = {
   "agent.primitive_gripper": True,
   "agent.gripper_offset": True,
   "agent.decay_updates": 0,
+  "agent.policy_components": 1,
   "agent.residual_blocks": 0,
   "agent.lstm_instants": 0,
   "agent.global_features": "map",
@@ -130,6 +131,8 @@ def test_every_field_has_a_docstring():
     ("agent.prior_mean", "zero", ["primitives", "learned"]),
     ("agent.policy_initial_std", 2.0, ["agent.policy_max_std"]),
     ("agent.policy_min_prob", 0.5, ["(0, 1/2)"]),
+    ("agent.policy_components", 0, ["positive"]),
+    ("agent.policy_components", 51, ["agent.policy_samples=100", "at least 102"]),
     ("agent.gamma", 1.5, ["(0, 1]"]),
     ("agent.v_min", 1.0, ["agent.v_max"]),
     ("agent.hidden", (), ["agent.hidden"]),
@@ -172,6 +175,13 @@ def test_errors_name_the_setting_and_the_fix(path, value, words):
 )
 def test_epsilon_is_bounded_only_where_candidates_are_weighted(epsilon, bounds):
   validate(changed("agent.epsilon", epsilon), algorithms={"ap_npql": bounds})
+
+
+def test_the_least_weight_leaves_room_for_all_components():
+  config = changed("agent.policy_components", 3)
+  validate(replaced(config, ["agent", "policy_min_prob"], 0.33))
+  with pytest.raises(ConfigError, match=r"policy_min_prob=0.34 must be .*1/3\)"):
+    validate(replaced(config, ["agent", "policy_min_prob"], 0.34))
 
 
 def test_a_fixed_temperature_enforces_no_limit():
@@ -295,7 +305,7 @@ def test_a_missing_setting_that_was_added_later_keeps_the_old_behavior():
   old = {k: v for k, v in data["agent"].items() if f"agent.{k}" not in ADDED}
   warnings = []
   assert config_from_json(json.dumps(data | {"agent": old}), warnings.append)
-  assert warnings[0].endswith("agent.image_shift 0, agent.color_jitter 0.0")
+  assert warnings[0].endswith("agent.color_jitter 0.0, agent.policy_components 1")
   assert config_from_json(config_to_json(TrainConfig()), pytest.fail)
 
 

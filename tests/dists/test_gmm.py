@@ -161,6 +161,26 @@ def test_samples_have_the_moments_of_the_mixture():
   assert actions[:, 6].mean() == pytest.approx(close, abs=0.005)
 
 
+def test_every_component_draws_for_itself():
+  """Whitened, the draws of all components are independent standard normals."""
+  mixture, n = random_gmm(7, batch=(2,)), 10_000
+  drawn = np.asarray(mixture.sample_each(jax.random.key(0), n), np.float64)
+  assert drawn.shape == (n, 3, 2, 6)
+  for state in range(2):
+    one = jax.tree.map(lambda x, i=state: np.asarray(x[i], np.float64), mixture)
+    centered = (drawn[:, :, state] - one.loc)[..., None]
+    white = np.linalg.solve(one.scale_tril, centered).reshape(n, -1)
+    assert np.abs(white.mean(0)).max() < 5.0 / np.sqrt(n)
+    assert np.abs(np.cov(white.T) - np.eye(18)).max() < 5.0 * np.sqrt(2.0 / n)
+    assert stats.kstest(white.ravel(), "norm").pvalue > 1e-3
+
+
+def test_one_component_draws_for_itself_what_the_mixture_draws():
+  mixture, key = random_gmm(8, batch=(2,), num=1), jax.random.key(0)
+  sampled = mixture.sample(seed=key, sample_shape=5)[..., :-1]
+  np.testing.assert_array_equal(mixture.sample_each(key, 5)[:, 0], sampled)
+
+
 def test_gripper_belongs_to_the_component_of_the_arm():
   mixture = GripperGMM(
     logits=jnp.zeros(2),

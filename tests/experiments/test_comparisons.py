@@ -45,6 +45,14 @@ def test_rows_of_the_paper_differ_in_the_algorithm_and_its_own_settings(
     assert config_diff(first, other).keys() <= {f"agent.{name}" for name in own}
 
 
+@pytest.mark.parametrize("row", ["ap_mpo", "ap_sac"])
+def test_rows_with_a_mixture_differ_only_in_its_components(row: str):
+  comparison, mixture = pixel_comparison.COMPARISON, f"{row}_mixture"
+  one, three = (comparison.config_of("push_plate", x, 0) for x in (row, mixture))
+  assert config_diff(one, three) == {"agent.policy_components": (1, 3)}
+  assert mixture not in comparison.wanted
+
+
 @pytest.mark.parametrize("task", ablations.COMPARISON.tasks)
 def test_each_ablation_changes_one_part(task: str):
   full, *others = (

@@ -50,6 +50,14 @@ def clip_action(actions: Float[Array, "*b 7"]) -> Float[Array, "*b 7"]:
   return jnp.clip(actions, -1.0, 1.0)
 
 
+def with_either_gripper(arm: Float[Array, " s *b 6"]) -> Float[Array, " 2*s *b 7"]:
+  """Pairs each arm action with both gripper commands, first all that open."""
+  command = jnp.zeros_like(arm[..., :1])
+  return jnp.concatenate(
+    [jnp.concatenate([arm, command + close], axis=-1) for close in (0.0, 1.0)]
+  )
+
+
 def score(
   heads: Heads, samples: Float[Array, " s *b 7"]
 ) -> tuple[Float[Array, " s *b 7"], Float[Array, " s *b n"], Float[Array, " s *b"]]:

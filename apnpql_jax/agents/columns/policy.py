@@ -15,6 +15,7 @@ from apnpql_jax.agents.columns.candidates import (
   all_on_the_highest,
   clip_action,
   score,
+  with_either_gripper,
 )
 from apnpql_jax.agents.networks import Heads
 from apnpql_jax.dists import boltzmann
@@ -68,18 +69,22 @@ def parametric(
 ) -> Candidates:
   """Samples the arm from pi_psi and pairs each draw with both gripper commands.
 
-  The two candidates of a draw share its weight in proportion to their density under
-  pi, so the sum over the gripper is exact. S is rounded down to an even number.
-  Gradients reach only psi, through draws and weights.
+  Each of the K components draws S / 2K times, and its draws share its weight, so the
+  sum over components is exact (stratified sampling). The two candidates of a draw share
+  its weight in proportion to their density under pi, so the sum over the gripper is
+  exact, too. S is rounded down to a multiple of 2K. Gradients reach only psi, through
+  draws and weights.
   """
   del prior
   policy = heads.policy()
-  drawn = policy.sample(seed=key, sample_shape=num_samples // 2)
-  both = jnp.stack([drawn.at[..., -1].set(gripper) for gripper in (0.0, 1.0)])
-  samples = both.reshape(-1, *drawn.shape[1:])
+  draws = num_samples // (2 * policy.logits.shape[-1])
+  arm = policy.sample_each(key, draws)
+  samples = with_either_gripper(arm.reshape(-1, *arm.shape[2:]))
   actions, outputs, q_values = score(heads.frozen(), samples)
-  log_prob = policy.log_prob(samples).reshape(both.shape[:-1])
-  weights = jax.nn.softmax(log_prob, axis=0).reshape(q_values.shape) / drawn.shape[0]
+  log_prob = policy.log_prob(samples).reshape(2, *arm.shape[:-1])
+  component = jnp.moveaxis(jnp.asarray(policy.choice.probs), -1, 0)
+  weights = component * jax.nn.softmax(log_prob, axis=0) / draws
+  weights = weights.reshape(q_values.shape)
   tilt = jnp.zeros(q_values.shape[1:])
   return Candidates(samples, actions, outputs, q_values, weights, policy, tilt)
 

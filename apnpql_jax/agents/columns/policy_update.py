@@ -51,7 +51,12 @@ def none(heads: Heads, prior: ActionDistribution, key: PRNGKeyArray) -> Improvem
 def forward_kl(
   heads: Heads, prior: ActionDistribution, key: PRNGKeyArray
 ) -> Improvement:
-  """Minimizes KL(q || pi_psi) by weighted maximum likelihood (MPO, moment matching)."""
+  """Minimizes KL(q || pi_psi) by weighted maximum likelihood (MPO, moment matching).
+
+  A mixture is fitted as a whole: each of its components learns from a candidate in
+  proportion to its responsibility for it, as in a gradient step of EM. The step of pi
+  has no limit of its own, neither on the means nor on the covariances.
+  """
   step = none(heads, prior, key)
   q, policy = step.candidates, heads.policy()
   fit = losses.weighted_nll(policy, q.samples, q.weights)
@@ -64,8 +69,9 @@ def reverse_kl(
 ) -> Improvement:
   """Minimizes KL(pi_psi || q) through alpha KL(pi || b) - E_pi[Q] (SAC, mode seeking).
 
-  The arm is reparameterized and the gripper summed over. With a uniform b the limit
-  KL(pi || b) <= epsilon is a floor on the entropy: H(pi) >= log volume - epsilon.
+  The arm is reparameterized; components and gripper are summed over. log pi is the
+  density of the whole mixture. With a uniform b the limit KL(pi || b) <= epsilon is a
+  floor on the entropy: H(pi) >= log volume - epsilon.
   """
   config = heads.config
   pi = parametric(heads, prior, key, num_samples=config.policy_samples)
