@@ -15,6 +15,7 @@ _MAX_RELATIVE = 0.5
 
 _MAX_ABSOLUTE = {
   "color": 1.0,
+  "surroundings": 1.0,
   "texture": 1.0,
   "light_turn": 0.9,
   "camera_shift": 0.2,
@@ -93,6 +94,9 @@ class RandomizationConfig:
 
   gripper_speed: float = 0.2
   """Speed of the gripper, relative."""
+
+  surroundings: float = codec.added(0.0)
+  """RGB of table and background beyond ``color``, on a scale of 0 to 1."""
 
 
 def validate_ranges(ranges: RandomizationConfig, prefix: str) -> None:

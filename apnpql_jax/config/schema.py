@@ -188,6 +188,9 @@ class AgentConfig:
   conv_overlap: bool = True
   """Second convolution 3x3 with stride 2; otherwise 2x2 patches, faster but coarser."""
 
+  standardize_images: bool = codec.added(False)
+  """Shift and scale each color channel of each image to mean 0 and deviation 1."""
+
   image_shift: int = codec.added(0)
   """Augmentation: largest random image shift along each axis in pixels."""
 

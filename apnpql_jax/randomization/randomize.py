@@ -25,7 +25,8 @@ from apnpql_jax.sim.scene import Scene
 from apnpql_jax.types import Array
 
 SEEN = (
-  "color texture light_turn light_level camera_shift camera_turn field_of_view"
+  "color surroundings texture light_turn light_level camera_shift camera_turn "
+  "field_of_view"
 ).split()
 """Ranges of what the cameras see and the physics does not depend on."""
 

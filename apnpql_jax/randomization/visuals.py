@@ -16,9 +16,12 @@ WAVES = (0.02, 0.3)  # m; wavelengths of noise
 
 def color(draw: Draw, world: World) -> None:
   """Changes the colors of robot, table, each object and the background separately."""
-  if not draw.config.color:
+  if not (draw.config.color or draw.config.surroundings):
     return
   change = draw.uniform("color", (world.model.nbody + 1, 3))
+  if draw.config.surroundings:
+    # The table belongs to the world, body 0; the background is the last.
+    change = change.at[np.array([0, -1])].add(draw.uniform("surroundings", (2, 3)))
   rgb, alpha = jnp.split(world["geom_rgba"], [3], axis=-1)
   rgb = (rgb + change[_groups(world.model)]).clip(0.0, 1.0)
   world["geom_rgba"] = jnp.concatenate([rgb, alpha], axis=-1)

@@ -51,12 +51,16 @@ def observation(batch: int, *, pixels: bool, objects: bool = False) -> Observati
 
 
 @pytest.mark.parametrize("shape", [(72, 96), (36, 64), (120, 160), (60, 107)])
-@pytest.mark.parametrize("overlap", [True, False])
-def test_pixel_encoder_is_two_convolutions(shape: tuple[int, int], overlap: bool):
+@pytest.mark.parametrize(
+  ("overlap", "standardize"), [(True, False), (False, False), (False, True)]
+)
+def test_pixel_encoder_is_two_convolutions(
+  shape: tuple[int, int], overlap: bool, standardize: bool
+):
   height, width = shape
   rng = np.random.default_rng(1)
   image = jnp.asarray(rng.integers(0, 256, (2, height, width, 3)), jnp.uint8)
-  module = encoder.PixelEncoder((5, 6), overlap)
+  module = encoder.PixelEncoder((5, 6), overlap, standardize=standardize)
   (flat, points), variables = module.init_with_output(jax.random.key(0), image)
   params = variables["params"]
 
@@ -67,6 +71,10 @@ def test_pixel_encoder_is_two_convolutions(shape: tuple[int, int], overlap: bool
 
   pad = ((0, 0), (0, -height % 8), (0, -width % 8), (0, 0))
   x = jnp.pad(image, pad).astype(jnp.float32) / 255.0
+  if standardize:
+    x = np.pad(image, pad, mode="edge").astype(np.float64)
+    x = (x - x.mean((1, 2), keepdims=True)) / x.std((1, 2), keepdims=True)
+    x = jnp.asarray(x, jnp.float32)
   x = convolve(x, params["patches"]["kernel"].reshape(4, 4, 3, 5), 4)
   first = x + params["patches"]["bias"]
   rows = params["conv"]["kernel"].reshape(-1, 5, 6)
@@ -84,6 +92,19 @@ def test_pixel_encoder_is_two_convolutions(shape: tuple[int, int], overlap: bool
   np.testing.assert_allclose(flat, expected, rtol=1e-4, atol=1e-5)
   expected = np.concatenate([expected_positions(x) for x in (first, second)], axis=-1)
   np.testing.assert_allclose(points, expected, atol=1e-4)
+
+
+def test_a_standardized_image_has_no_exposure_and_no_white_balance():
+  rng = np.random.default_rng(2)
+  image = rng.integers(0, 80, (2, 36, 64, 3), np.uint8)
+  other = image * np.array([3, 2, 1], np.uint8) + np.array([0, 60, 170], np.uint8)
+  for standardize in (True, False):
+    module = encoder.PixelEncoder((5, 6), overlap=True, standardize=standardize)
+    params = module.init(jax.random.key(0), image)
+    same = np.allclose(
+      module.apply(params, image)[0], module.apply(params, other)[0], atol=1e-4
+    )
+    assert same == standardize
 
 
 def test_a_positionwise_layer_is_the_dense_layer_of_flax():

@@ -23,7 +23,7 @@ from apnpql_jax.tasks import make_task, task_names
 from apnpql_jax.training.rollout import FILMED, expert_policy, make_player
 
 WORLDS = 8
-ALL = RandomizationConfig()
+ALL = RandomizationConfig(surroundings=0.4)
 NONE = RandomizationConfig(
   **{field.name: 0.0 for field in dataclasses.fields(RandomizationConfig)}
 )
@@ -42,6 +42,7 @@ SIZES = {
 }
 CHANGES = {
   "color": {"geom_rgba", "background"},
+  "surroundings": {"geom_rgba", "background"},
   "texture": {"waves", "odd_rgb", "grain"},
   "light_turn": {"light_dir"},
   "light_level": {"light_ambient", "light_diffuse"},
@@ -121,14 +122,13 @@ def test_a_setting_does_not_change_what_the_others_draw(task, drawn):
 
 def test_draws_fill_their_range_and_differ_between_worlds(task, drawn):
   model, fields = task.scene.model, {k: np.asarray(v) for k, v in drawn.fields.items()}
-  body, table = model.body("plate").id, model.geom("table").id
-  plate = model.geom("plate_floor").id
+  body, plate = model.body("plate").id, model.geom("plate_floor").id
   ratios = {
     "mass": fields["body_mass"][:, body] / model.body_mass[body],
     "friction": fields["pair_friction"][:, 3, 0] / model.pair_friction[3, 0],
     "gripper_speed": fields["gripper_speed"] / motors.GRIPPER_SPEED,
     "field_of_view": fields["cam_fovy"][:, 0] / model.cam_fovy[0],
-    "color": 1 + fields["geom_rgba"][:, table, 1] - model.geom_rgba[table, 1],
+    "color": 1 + fields["geom_rgba"][:, plate, 1] - model.geom_rgba[plate, 1],
     "table_height": 1 + fields["body_pos"][:, 1, 2] - model.body_pos[1, 2],
     "shape": np.divide(*fields["geom_size"][:, plate, 1::-1].T)
     / np.divide(*model.geom_size[plate, 1::-1]),
@@ -170,6 +170,17 @@ def test_geoms_of_the_robot_change_their_color_together(task, drawn):
   for geom in arm_geoms:
     np.testing.assert_allclose(change[geom], change[arm_geoms[0]], atol=1e-6)
   np.testing.assert_array_equal(change[:, 3], 0.0)
+
+
+def test_surroundings_are_table_and_background_alone(task):
+  model = task.scene.model
+  fields = _randomized(task, dataclasses.replace(NONE, surroundings=0.2)).fields
+  change = np.asarray(fields["geom_rgba"]) - model.geom_rgba
+  table, background = model.geom("table").id, np.asarray(fields["background"])
+  assert np.abs(np.delete(change, table, axis=1)).max() == 0.0
+  assert 0.1 < np.abs(change[:, table]).max() <= 0.2001
+  assert np.ptp(background, axis=0).min() > 0.1
+  assert not np.allclose(change[:, table, :3], background - background.mean(0))
 
 
 @pytest.fixture(scope="module", params=task_names())
