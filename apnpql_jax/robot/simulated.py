@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator
 import contextlib
 import dataclasses
+from importlib.metadata import version
 from multiprocessing import get_context
 from typing import Any
 
@@ -53,7 +54,7 @@ class SimulatedArm(_OnBoard):
 
   def describe(self) -> dict[str, Any]:
     """See ``Device.describe``."""
-    return {"model": "simulated UR5e"}
+    return {"model": "simulated UR5e", "mujoco": version("mujoco")}
 
   def get_observation(self) -> ArmState:
     """See ``Arm.get_observation``."""

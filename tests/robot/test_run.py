@@ -97,7 +97,10 @@ def test_an_untrained_policy_plays_its_episodes_in_order(folder):
   assert [x["dataset_index"] for x in kept] == [0, 1]
   for episode in kept:
     check_events(episode)
-  first = lerobot.read(folder / "log").episodes[0]
+  log = lerobot.read(folder / "log")
+  assert log.about["devices"]["robot"] == "simulated"
+  assert [*log.about["devices"]["cameras"]] == ["global", "wrist"]
+  first = log.episodes[0]
   assert len(first.actions) == kept[0]["actions"]
   assert np.abs(first.actions[:, :6]).max() <= 1
 

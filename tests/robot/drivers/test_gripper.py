@@ -19,7 +19,7 @@ import pytest
 from apnpql_jax.config import files
 from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot import doubles
-from apnpql_jax.robot.doubles.dynamixel import crc
+from apnpql_jax.robot.doubles.dynamixel import FIRMWARE, crc
 from apnpql_jax.robot.doubles.modbus import crc as modbus_crc
 from apnpql_jax.robot.doubles.server import ask
 from apnpql_jax.robot.drivers import buses, gripper as driver
@@ -119,6 +119,7 @@ def test_the_model_is_identified_and_opens_and_closes(number, bus):
     about = gripper.describe()
     found = about["model"], about["model_number"], about["bus"]
     assert found == (MODELS[number], number, bus)
+    assert about["firmware"] == FIRMWARE
     for close, angle in ((False, 0.0), (True, 1.1), (False, 0.0)):
       gripper.send_action(close)
       gripper.send_action(close)  # Changes nothing.

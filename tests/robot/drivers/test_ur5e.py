@@ -16,6 +16,7 @@ import pytest
 
 from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot import doubles
+from apnpql_jax.robot.doubles.controller import SERIAL, VERSION
 from apnpql_jax.robot.drivers.ur5e import UR5e
 from apnpql_jax.robot.limits import TIMESTEP
 
@@ -215,8 +216,9 @@ def test_a_slowed_arm_does_not_start():
 
 def test_describe_names_device_and_versions(rig):
   about = rig.arm.describe()
-  assert about["model"] == "UR5e" and about["serial_number"]
-  assert about["polyscope"].startswith("5.")
+  assert (about["model"], about["serial_number"]) == ("UR5e", SERIAL)
+  assert about["polyscope"] == ".".join(map(str, VERSION))
+  assert about["payload_kg"] == doubles.PAYLOAD_KG
 
 
 def _silent(client: socket.socket) -> None:
