@@ -48,7 +48,8 @@ class Phase(enum.IntEnum):
 RECORDS = {
   # From the main process.
   "order": [("number", "i8"), ("phase", "i8"), ("target", "f8", 6), ("close", "i8")],
-  # From the control process; "number" is that of the order that "phase" obeys.
+  # From the control process; "number" is that of the order that "phase" obeys, "free"
+  # the wrench that the free hand has read at home, NaN on the way.
   "state": [
     ("number", "i8"),
     ("phase", "i8"),
@@ -63,6 +64,7 @@ RECORDS = {
     ("reason", TEXT),
     ("done", "i8"),
     ("at_rest", "i8"),
+    ("free", "f8", 6),
     ("periods", "i8", PERIOD_BINS),
   ],
   # From the control process, once it has opened them: see ``Device.describe``.

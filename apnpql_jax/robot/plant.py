@@ -55,13 +55,14 @@ class Plant:
     self._finger, self._finger_dof = int(finger.qposadr[0]), int(finger.dofadr[0])
     self._limit = model.actuator_ctrlrange[: len(JOINTS), 1].copy()
     self._hand = _subtree(model, model.body("gripper").id)
-    self._sensor = Sensor(np.random.default_rng(seed))
+    self.sensor = Sensor(np.random.default_rng(seed))
+    """The force-torque sensor."""
     self.data.qpos[:] = model.keyframe("neutral").qpos
     self._settle()
 
   def zero_force(self) -> None:
     """Zeroes the sensor: what it feels now, it takes for nothing."""
-    self._sensor.zero(self.wrench())
+    self.sensor.zero(self.wrench())
 
   def place(
     self, qpos: np.ndarray, mocap_pos: np.ndarray, mocap_quat: np.ndarray
@@ -114,7 +115,7 @@ class Plant:
     """Returns what the arm measures."""
     data = self.data
     position, velocity = data.qpos[self._qpos].copy(), data.qvel[self._dof].copy()
-    return ArmState(now, position, velocity, self._sensor.read(self.wrench()))
+    return ArmState(now, position, velocity, self.sensor.read(self.wrench()))
 
   def wrench(self) -> np.ndarray:
     """Returns force and torque of the contacts on the hand, see ``ArmState.wrench``."""

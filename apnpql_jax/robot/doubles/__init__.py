@@ -53,6 +53,10 @@ class Doubles:
     """Ends the program on the controller, as the teach pendant can."""
     ask(self.host, "stop_program")
 
+  def drift_force(self) -> None:
+    """Moves the zero of the force-torque sensor."""
+    ask(self.host, "drift_force")
+
   def silence_gripper(self) -> None:
     """Makes the gripper ignore its bus, as without power."""
     ask(self.host, "silence_gripper")

@@ -25,6 +25,7 @@ STIFFNESS, DAMPING = 1e4, 200.0  # 1/s^2, 1/s: critically damped at 16 Hz
 DEVIATION_LIMIT = 0.15  # rad between target and joint, beyond which the arm stops
 FORCE_LIMIT = 150.0  # N on the tool: the default of the safety settings
 BIAS = np.array([2.0, -1.5, 3.0, 0.1, -0.2, 0.05])  # N, N m: of the sensor when on
+DRIFT = np.array([6.0, 0.0, -10.0, 0.0, 0.3, 0.0])  # N, N m: of ``World.drift``
 NOISE = np.array([0.3, 0.3, 0.3, 0.01, 0.01, 0.01])  # N, N m: standard deviations
 REFERENCE_GAIN = 300.0
 
@@ -58,7 +59,7 @@ class World:
     self.lock()
     self._finger_goal, self._finger_speed, self._grip = self.finger, 0.0, 0.0
     self._rng = np.random.default_rng(0) if noise else None
-    self._zero = np.zeros(6)
+    self._bias, self._zero = BIAS, np.zeros(6)
     self._payload = 0.0, np.zeros(3)
     mujoco.mj_forward(model, data)
     self.wrench = self._measure()
@@ -119,6 +120,10 @@ class World:
     """Makes the present wrench the origin of its measurement."""
     self._zero = self._measure() + self._zero
 
+  def drift(self) -> None:
+    """Moves the zero of the wrench by ``DRIFT``, as warming up does, but at once."""
+    self._bias = self._bias + DRIFT
+
   def step(self) -> str:
     """Advances by 2 ms; returns why the controller would stop the arm, or ""."""
     self._smooth()
@@ -168,7 +173,8 @@ class World:
     frame = self._flange.xmat.reshape(3, 3)
     wrench -= _moment(mass * self.model.opt.gravity, frame @ at)
     base = self._base.xmat.reshape(3, 3)
-    turned = np.concatenate([wrench[:3] @ base, wrench[3:] @ base]) + BIAS - self._zero
+    turned = np.concatenate([wrench[:3] @ base, wrench[3:] @ base])
+    turned += self._bias - self._zero
     return turned + NOISE * self._rng.normal(size=6) if self._rng else turned
 
   def _contact(self) -> np.ndarray:

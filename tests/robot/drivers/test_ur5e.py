@@ -17,6 +17,7 @@ import pytest
 from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot import doubles
 from apnpql_jax.robot.doubles.controller import SERIAL, VERSION
+from apnpql_jax.robot.doubles.plant import DRIFT
 from apnpql_jax.robot.drivers.ur5e import UR5e
 from apnpql_jax.robot.limits import TIMESTEP
 
@@ -110,6 +111,14 @@ def test_start_keeps_the_zero_if_asked_to():
     devices.arm.stop()
     devices.arm.start()
     assert np.linalg.norm(devices.arm.get_observation().wrench) < 1e-3
+
+
+def test_the_zero_of_the_wrench_drifts_until_the_next_one(rig):
+  rig.drift_force()
+  rig.arm.stop()
+  np.testing.assert_allclose(rig.arm.get_observation().wrench, DRIFT, atol=1e-3)
+  rig.arm.start()
+  assert np.linalg.norm(rig.arm.get_observation().wrench) < 1e-3
 
 
 def test_the_table_pushes_the_tool_up(rig):
