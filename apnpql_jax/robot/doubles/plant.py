@@ -16,9 +16,10 @@ import mujoco
 import numpy as np
 
 from apnpql_jax.config import files
+from apnpql_jax.robot.arm_model import BASE, FLANGE, JOINTS
 from apnpql_jax.robot.limits import TIMESTEP
+from apnpql_jax.robot.plant import subtree
 
-JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 FINGER = "finger_r1"
 SPEED_LIMIT = math.pi  # rad/s, the UR5e's joints, data sheet
 STIFFNESS, DAMPING = 1e4, 200.0  # 1/s^2, 1/s: critically damped at 16 Hz
@@ -50,9 +51,9 @@ class World:
     finger = model.joint(FINGER)
     self._finger, self._finger_dof = int(finger.qposadr[0]), int(finger.dofadr[0])
     self._gripper = model.body("gripper").id
-    self._tool = _subtree(model, self._gripper)
+    self._tool = subtree(model, self._gripper)
     self._weight = model.body_subtreemass[self._gripper] * model.opt.gravity
-    self._flange, self._base = data.site("attachment_site"), data.site("base_frame")
+    self._flange, self._base = data.site(FLANGE), data.site(BASE)
     self._mass = np.zeros((model.nv, model.nv))
     self._block = np.ix_(self._dofs, self._dofs)
     self._goal, self._lag = self.position, TIMESTEP
@@ -206,11 +207,3 @@ def _clipped(value: float, limit: float) -> float:
 def _moment(force: np.ndarray, arm: np.ndarray) -> np.ndarray:
   (x, y, z), (a, b, c) = arm, force
   return np.array([a, b, c, y * c - z * b, z * a - x * c, x * b - y * a])
-
-
-def _subtree(model: mujoco.MjModel, root: int) -> np.ndarray:
-  """Returns bool[bodies]: whether a body hangs on ``root``."""
-  inside = np.zeros(model.nbody, bool)
-  for body in range(root, model.nbody):
-    inside[body] = body == root or inside[model.body_parentid[body]]
-  return inside
