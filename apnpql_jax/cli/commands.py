@@ -114,6 +114,8 @@ def diagnose(args: Diagnose) -> Json:
     seed=args.seed,
     backend=args.backend,
     step=checkpoint_step(args.run, args.checkpoint),
+    acting=args.acting,
+    bank_seed=args.bank_seed,
   )
 
 

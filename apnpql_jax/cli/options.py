@@ -124,14 +124,7 @@ class Train(OfRun):
 
 
 @dataclasses.dataclass(frozen=True)
-class Evaluate(_Play, OfRun):
-  """Plays held-out episodes with a trained agent: apnpql evaluate RUN [options].
-
-  apnpql evaluate runs/mine --episodes 200 --seed 7
-
-  apnpql evaluate runs/mine --checkpoint best --video best.mp4
-  """
-
+class _HeldOut(OfRun):
   run: tyro.conf.Positional[str] = ""
   """Run folder."""
 
@@ -151,28 +144,29 @@ class Evaluate(_Play, OfRun):
 
 
 @dataclasses.dataclass(frozen=True)
-class Diagnose(OfRun):
+class Evaluate(_Play, _HeldOut):
+  """Plays held-out episodes with a trained agent: apnpql evaluate RUN [options].
+
+  apnpql evaluate runs/mine --episodes 200 --seed 7
+
+  apnpql evaluate runs/mine --checkpoint best --video best.mp4
+  """
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnose(_HeldOut):
   """Reports where and why an agent fails: apnpql diagnose RUN [options].
 
   apnpql diagnose runs/mine
 
-  apnpql diagnose runs/mine --checkpoint best --episodes 128
+  apnpql diagnose runs/mine --checkpoint best --episodes 128 --acting policy
   """
-
-  run: tyro.conf.Positional[str] = ""
-  """Run folder."""
-
-  checkpoint: str = "newest"
-  """Checkpoint: newest, best (highest success rate in training) or its step."""
 
   episodes: int = 64
   """Number of episodes of each acting rule."""
 
   seed: int = 0
   """Random seed of the episodes and of the policy."""
-
-  backend: AsTrained = None
-  """Physics engine: auto, mjx or native."""
 
 
 @dataclasses.dataclass(frozen=True)

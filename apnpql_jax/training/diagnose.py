@@ -23,6 +23,8 @@ from apnpql_jax.config.checks import ACTING
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.envs.env import Env
 from apnpql_jax.envs.state import EnvState
+from apnpql_jax.errors import check_name
+from apnpql_jax.primitives import reset_bank
 from apnpql_jax.training import evaluate
 from apnpql_jax.training.rollout import agent_policy, make_player
 from apnpql_jax.types import ARM_DOF, PRIMITIVES, Array
@@ -56,15 +58,19 @@ def diagnose(
   seed: int = 0,
   backend: str | None = None,
   step: int | None = None,
+  acting: str | None = None,
+  bank_seed: int = reset_bank.SEED,
 ) -> dict[str, Any]:
   """Plays held-out episodes with a checkpoint of a run and reports what limits them.
 
-  The arguments and errors are those of ``evaluate``.
+  The arguments and errors are those of ``evaluate``. ``acting`` plays the episodes that
+  all figures but ``solved`` are about.
 
   Returns:
+    acting: That rule.
     solved: Episodes solved by each acting rule, see ``agents/acting.py``.
-    failures: Failed episodes of the policy by their last stage. "object after goal" is
-      an object that was lost.
+    failures: Failed episodes by their last stage. "object after goal" is an object that
+      was lost.
     stages: For each stage, the share of instants, the error of each primitive (rad/s)
       and the share of wrong gripper commands of the primitive in use.
     kl_over_epsilon, alpha: Quantiles over instants.
@@ -72,15 +78,18 @@ def diagnose(
       mean return, which is zero in failed episodes.
   """
   evaluate.check_count(episodes, seed)
+  if acting is not None:
+    check_name("acting", acting, ACTING)
   config, env, agent, params, step = evaluate.load_trained(
-    run_dir, backend=backend, step=step
+    run_dir, backend=backend, step=step, bank_seed=bank_seed, held_out=episodes
   )
   solved = {}
-  for acting in ACTING:
-    play = make_player(env, lambda p, rule=acting: agent_policy(agent, p, acting=rule))
+  for name in ACTING:
+    play = make_player(env, lambda p, rule=name: agent_policy(agent, p, acting=rule))
     played = evaluate.play_held_out(env, play, params, episodes=episodes, seed=seed)
-    solved[acting] = int(played.success.sum())
-  record = make_recorder(env, agent, config.agent)
+    solved[name] = int(played.success.sum())
+  acting = acting or config.eval_acting
+  record = make_recorder(env, agent, config.agent, acting=acting)
   batches = [
     jax.device_get(record(params, rows, key))
     for rows, key in evaluate.held_out_batches(env, episodes=episodes, seed=seed)
@@ -91,19 +100,22 @@ def diagnose(
     "algorithm": config.agent.algorithm,
     "checkpoint_step": step,
     "episodes": episodes,
+    "acting": acting,
     "solved": solved,
     **summarize(instants, config.agent),
   }
 
 
-def make_recorder(env: Env, agent: Agent, config: AgentConfig) -> Recorder:
-  """Returns a jitted function that plays one episode per row with the policy."""
+def make_recorder(
+  env: Env, agent: Agent, config: AgentConfig, *, acting: str = "policy"
+) -> Recorder:
+  """Returns a jitted function that plays one episode per row by an acting rule."""
   algorithm = algorithm_of(config)
 
   def at(params: Any, state: EnvState, key: PRNGKeyArray) -> tuple[Array, Instants]:
     act_key, kl_key = jax.random.split(key)
     heads = agent.networks.at(params, state.observation)
-    action, info = agent.act(params, state.observation, act_key)
+    action, info = agent.act(params, state.observation, act_key, acting=acting)
     prior = algorithm.regularizer(heads, heads)
     predicted, label = heads.primitives(), state.timestep.primitives
     # The last component is a logit in the prediction and a command in the label.

@@ -123,24 +123,14 @@ def evaluate(
   began, video = time.monotonic(), _check(episodes, seed, video)
   if acting is not None:
     check_name("acting", acting, ACTING)
-  if not 0 <= bank_seed < 2**31:
-    raise ConfigError(f"bank_seed={bank_seed} must be within 0 and 2**31 - 1")
-  fresh = None if bank_seed == reset_bank.SEED else FreshBank(bank_seed, episodes)
   config, env, agent, params, step = load_trained(
-    run_dir, backend=backend, step=step, fresh=fresh
+    run_dir, backend=backend, step=step, bank_seed=bank_seed, held_out=episodes
   )
   acting = acting or config.eval_acting
   play = make_player(env, lambda params: agent_policy(agent, params, acting=acting))
   played = play_held_out(env, play, params, episodes=episodes, seed=seed)
   about = {"algorithm": config.agent.algorithm, "acting": acting}
   return _summary(env, played, about, step, began, video)
-
-
-class FreshBank(NamedTuple):
-  """Reset states other than those of training."""
-
-  seed: int
-  held_out: int  # number of held-out rows
 
 
 class Trained(NamedTuple):
@@ -158,23 +148,26 @@ def load_trained(
   *,
   backend: str | None,
   step: int | None,
-  fresh: FreshBank | None = None,
+  bank_seed: int = reset_bank.SEED,
+  held_out: int = 0,
 ) -> Trained:
   """Restores the weights of a run, and builds its worlds and agent.
 
-  ``backend`` and ``step`` are as in ``evaluate``, and so are the errors. ``fresh`` are
-  reset states in place of those of the run.
+  ``backend``, ``step`` and ``bank_seed`` are as in ``evaluate``, and so are the errors.
+  A bank of another seed has at least ``held_out`` held-out rows.
   """
+  if not 0 <= bank_seed < 2**31:
+    raise ConfigError(f"bank_seed={bank_seed} must be within 0 and 2**31 - 1")
   run_dir = Path(run_dir)
   config = run_folder.open_run(run_dir).config
   env_config = dataclasses.replace(config.env, backend=backend or config.env.backend)
   check_env(env_config)
   checkpoint_reader.restore(run_dir, step, {}, config=config)  # Fails early.
-  seed, instants = reset_bank.SEED, config.agent.lstm_instants
-  if fresh is not None:
-    rows = max(MIN_BANK_ROWS, math.ceil(fresh.held_out / HELD_OUT_SHARE))
-    seed, env_config = fresh.seed, dataclasses.replace(env_config, bank_rows=rows)
-  env = make_env(env_config, instants=instants, bank_seed=seed)
+  if bank_seed != reset_bank.SEED:
+    rows = max(MIN_BANK_ROWS, math.ceil(held_out / HELD_OUT_SHARE))
+    env_config = dataclasses.replace(env_config, bank_rows=rows)
+  instants = config.agent.lstm_instants
+  env = make_env(env_config, instants=instants, bank_seed=bank_seed)
   return Trained(config, env, *load_agent(run_dir, config, env.task, step=step))
 
 

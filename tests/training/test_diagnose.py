@@ -51,6 +51,20 @@ def test_errors_are_those_of_the_predicted_primitives(recorded):
   np.testing.assert_array_equal(instants.gripper[0], wrong)
 
 
+def test_means_do_not_depend_on_the_key(recorded):
+  """Draws do, so that the acting rule shows."""
+  agent, params, *_ = recorded
+  config = testing.TINY
+  env = make_env(dataclasses.replace(config.env, time_limit_s=0.75))
+  chosen = {}
+  for acting in ("mean", "policy"):
+    record = make_recorder(env, agent, config.agent, acting=acting)
+    runs = [record(params, jnp.arange(WORLDS), jax.random.key(seed)) for seed in (1, 2)]
+    chosen[acting] = np.asarray(runs[0].q) == np.asarray(runs[1].q)
+  assert chosen["mean"].all()
+  assert not chosen["policy"].all()
+
+
 def test_an_episode_begins_with_the_way_to_the_object(recorded):
   *_, instants = recorded
   np.testing.assert_array_equal(instants.stage[0], 0)

@@ -1,0 +1,64 @@
+"""A search for settings of the paper's algorithms, from pixels: curves and a table.
+
+  python experiments/results/search.py --jobs 2        # hours
+  python experiments/results/search.py --rows ap_mpo_1 ap_mpo_2
+
+See ``comparison``. The budget is the same for every algorithm: the settings that a
+search from states found (row_0), and a Latin hypercube of TRIALS points in as many
+dimensions (row_1, ...), on push_plate with one seed. What counts is success by draws,
+from reset states that neither training nor ``pixel_comparison`` uses.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from comparison import PAPER, Row
+import numpy as np
+import pixel_comparison
+from scipy.stats import qmc
+import state_comparison
+
+TRIALS = 2
+
+_COMMON = {"min-alpha": (0.001, 0.01), "learning-rate-e": (3e-4, 1e-3)}
+_MPO = {"epsilon": (0.5, 3.0), "policy-max-std": (0.1, 1.0)}
+
+SPACES = {
+  "ap_npql": _COMMON | {"epsilon": (0.5, 3.0), "max-std": (0.04, 0.1)},
+  "ap_mpo": _COMMON | _MPO,
+  "ap_sac": _COMMON | _MPO | {"epsilon": (10.0, 50.0)},
+  "sac": _COMMON | {"epsilon": (7.0, 12.0), "policy-initial-std": (0.05, 0.5)},
+}
+"""Ranges of the settings of ``agent`` by row, on a logarithmic scale."""
+
+
+def trials(row: str) -> dict[str, Row]:
+  """Returns the settings of a row's runs."""
+  found, space = state_comparison.ROWS[row], SPACES[row]
+  low, high = np.log(list(space.values())).T
+  cube = qmc.LatinHypercube(len(space), rng=PAPER.index(row)).random(TRIALS)
+  rows = {f"{row}_0": found}
+  for trial, point in enumerate(np.exp(low + cube * (high - low)), start=1):
+    flags = (f"--agent.{k} {x:.2g}" for k, x in zip(space, point, strict=True))
+    rows[f"{row}_{trial}"] = Row(found.algorithm, " ".join([found.flags, *flags]))
+  return rows
+
+
+ROWS = {name: trial for row in PAPER for name, trial in trials(row).items()}
+
+COMPARISON = dataclasses.replace(
+  pixel_comparison.COMPARISON,
+  out=Path(__file__).resolve().with_suffix(""),
+  sweep=Path("runs/search"),
+  rows=ROWS,
+  options=lambda task, row, seed: pixel_comparison.options(task, ROWS[row], seed),
+  play="--episodes 512 --bank-seed 2",
+  tasks=("push_plate",),
+  wanted=tuple(ROWS),
+  seeds=(0,),
+)
+
+if __name__ == "__main__":
+  COMPARISON.main(__doc__)
