@@ -25,6 +25,9 @@ PERIOD_BINS, PERIOD_BIN_S = 64, 0.00025
 TEXT = "S200"
 """Type of a line in a record."""
 
+DESCRIPTION = "S4096"
+"""Type of what a device says of itself, as JSON."""
+
 
 class Phase(enum.IntEnum):
   """What the control process is to do, or does."""
@@ -45,7 +48,8 @@ class Phase(enum.IntEnum):
 RECORDS = {
   # From the main process.
   "order": [("number", "i8"), ("phase", "i8"), ("target", "f8", 6), ("close", "i8")],
-  # From the control process; "number" is that of the order that "phase" obeys.
+  # From the control process; "number" is that of the order that "phase" obeys, "free"
+  # the wrench that the free hand has read at home, NaN on the way.
   "state": [
     ("number", "i8"),
     ("phase", "i8"),
@@ -60,8 +64,11 @@ RECORDS = {
     ("reason", TEXT),
     ("done", "i8"),
     ("at_rest", "i8"),
+    ("free", "f8", 6),
     ("periods", "i8", PERIOD_BINS),
   ],
+  # From the control process, once it has opened them: see ``Device.describe``.
+  "devices": [("arm", DESCRIPTION), ("gripper", DESCRIPTION)],
   # From the policy process; "order" is that of the episode, "ended" that of the last
   # one that has ended and is in the log, "index" its number there or -1.
   "action": [
@@ -94,7 +101,7 @@ _HEAD = 16
 
 
 def text(value: Any) -> str:
-  """Returns a field of type ``TEXT`` as it can be shown, whatever its bytes."""
+  """Returns a field of text as it can be shown, whatever its bytes."""
   return bytes(value).decode(errors="replace")
 
 
@@ -118,7 +125,9 @@ class Record:
   def write(self, values: Mapping[str, Any]) -> None:
     """Changes the fields ``values`` and publishes the record."""
     for name, value in values.items():
-      self._own[name] = _bytes(value) if isinstance(value, str) else value
+      if isinstance(value, str):
+        value = _bytes(value, self._own[name].itemsize)
+      self._own[name] = value
     data = self._own.tobytes()
     self._head[0] += 1  # Odd: being written.
     self._body[:] = data
@@ -199,7 +208,6 @@ def _let_go(
       memory.unlink()
 
 
-def _bytes(line: str) -> bytes:
-  """Returns a line for a field of type ``TEXT``, cut between two characters."""
-  size = np.dtype(TEXT).itemsize
+def _bytes(line: str, size: int) -> bytes:
+  """Returns text for a field of ``size`` bytes, cut between two characters."""
   return line.encode()[:size].decode(errors="ignore").encode()

@@ -43,6 +43,7 @@ class Control:
     self._arm, self._hand, self._core, self._board = arm, hand, core, board
     self._events, self._clock = events, clock or Clock()
     self._number, self._phase, self._done = 0, Phase.IDLE, False
+    self._began = 0.0
     self._target, self._closed = np.zeros(6), False
     self._told, self._ending = (Mode.FOLLOW, ""), ""
     self._last, self._periods = 0.0, np.zeros(PERIOD_BINS, int)
@@ -114,16 +115,22 @@ class Control:
     command = core.move(now, state, self._target)
     if command.mode is Mode.FOLLOW:
       hand.move(now, self._closed)
-      waited = core.has_arrived(self._target) and now - hand.since > GRIP_S
-      if waited and not hand.is_at(self._closed):
+      waited = now - max(hand.since, self._began) > GRIP_S
+      arrived = core.has_arrived(self._target)
+      if waited and arrived and not hand.is_at(self._closed):
         angle = hand.state.angle
         core.supervisor.stop(f"gripper: still at {angle:.2f} rad after {GRIP_S:g} s")
     return command
 
   def _is_home(self, command: Command) -> bool:
-    """Returns whether arm and gripper are as an episode begins."""
+    """Returns whether arm, gripper and force sensor are as an episode begins."""
     arrived = command.mode is Mode.FOLLOW and self._core.has_arrived(self._target)
-    return arrived and self._hand.is_at(self._closed)
+    if not (arrived and self._hand.is_at(self._closed)):
+      self._zero.forget()
+      return False
+    refusal = self._zero.check() if self._zero.is_sure else ""
+    self._core.supervisor.stop(refusal)
+    return self._zero.is_sure and not refusal
 
   def _action(self) -> Action | None:
     """Returns the policy's newest action of this episode, if there is one."""
@@ -148,8 +155,8 @@ class Control:
       self._target, self._closed = order["target"].copy(), bool(order["close"])
       home = self._phase is Phase.HOME
       refusal = self._zero.start(self._arm, again=not home)
-      goal = self._target if home else None
-      self._core.start(self._clock.now(), self._arm.get_observation(), goal)
+      goal, self._began = self._target if home else None, self._clock.now()
+      self._core.start(self._began, self._arm.get_observation(), goal)
       self._core.supervisor.stop(refusal)
       self._last = 0.0
 
@@ -190,6 +197,7 @@ class Control:
         "reason": self._told[1],
         "done": self._done,
         "at_rest": self.at_rest,
+        "free": self._zero.free,
         "periods": self._periods,
       }
     )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import json
 from multiprocessing import connection, parent_process
 import os
 import select
@@ -56,6 +57,8 @@ def main(
       ends = robot.contract["joints"]["gripper"]
       hand = Hand(gripper, open_rad=ends["open_rad"], closed_rad=ends["closed_rad"])
       control = Control(arm, hand, core, board, events=events, clock=robot.clock)
+      found = {"arm": arm.describe(), "gripper": gripper.describe()}
+      board["devices"].write({name: json.dumps(x) for name, x in found.items()})
       gc.collect()
       gc.freeze()
       gc.disable()  # A collection could delay a cycle.

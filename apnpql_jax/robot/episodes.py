@@ -28,6 +28,18 @@ class Options:
 
 
 @dataclasses.dataclass(frozen=True)
+class Home:
+  """What came of a way home."""
+
+  free: list[float] | None = None
+  """What the free hand read there, f64[6] in N and N m, with the zero of the motion
+  before; None if the robot did not get there."""
+
+  put_back: str | None = None
+  """Why a simulated robot did not get there and was put back where it began."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Outcome:
   """What became of an episode."""
 
@@ -54,6 +66,12 @@ class Outcome:
 
   dataset_index: int | None = None
   """Index of the episode in the dataset of the log, if it is there."""
+
+  before: Home = Home()
+  """The way home before the episode, after which the sensor was zeroed."""
+
+  after: Home | None = None
+  """The way home after the episode; None if there was none."""
 
   @property
   def stopped(self) -> bool:

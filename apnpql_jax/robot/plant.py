@@ -54,14 +54,16 @@ class Plant:
     finger = model.joint("finger_r1")
     self._finger, self._finger_dof = int(finger.qposadr[0]), int(finger.dofadr[0])
     self._limit = model.actuator_ctrlrange[: len(JOINTS), 1].copy()
-    self._hand = _subtree(model, model.body("gripper").id)
-    self._sensor = Sensor(np.random.default_rng(seed))
+    self._gripper = model.body("gripper").id
+    self._hand = subtree(model, self._gripper)
+    self.sensor = Sensor(np.random.default_rng(seed))
+    """The force-torque sensor."""
     self.data.qpos[:] = model.keyframe("neutral").qpos
     self._settle()
 
   def zero_force(self) -> None:
     """Zeroes the sensor: what it feels now, it takes for nothing."""
-    self._sensor.zero(self.wrench())
+    self.sensor.zero(self.wrench())
 
   def place(
     self, qpos: np.ndarray, mocap_pos: np.ndarray, mocap_quat: np.ndarray
@@ -114,7 +116,7 @@ class Plant:
     """Returns what the arm measures."""
     data = self.data
     position, velocity = data.qpos[self._qpos].copy(), data.qvel[self._dof].copy()
-    return ArmState(now, position, velocity, self._sensor.read(self.wrench()))
+    return ArmState(now, position, velocity, self.sensor.read(self.wrench()))
 
   def wrench(self) -> np.ndarray:
     """Returns force and torque of the contacts on the hand, see ``ArmState.wrench``."""
@@ -122,7 +124,7 @@ class Plant:
     mujoco.mj_rnePostConstraint(model, data)
     torque, force = np.split(data.cfrc_ext[self._hand].sum(0), 2)
     flange, base = data.site(FLANGE), data.site(BASE)
-    center = data.subtree_com[model.body_rootid[self._hand[0]]]
+    center = data.subtree_com[model.body_rootid[self._gripper]]
     torque = torque + np.cross(center - flange.xpos, force)
     turn = base.xmat.reshape(3, 3).T
     return np.concatenate([turn @ force, turn @ torque])
@@ -140,10 +142,9 @@ class Plant:
     mujoco.mj_forward(self.model, self.data)
 
 
-def _subtree(model: mujoco.MjModel, top: int) -> np.ndarray:
-  """Returns the ids of a body and of all below it."""
-  found = [top]
-  for body in range(top + 1, model.nbody):
-    if model.body_parentid[body] in found:
-      found.append(body)
-  return np.array(found)
+def subtree(model: mujoco.MjModel, root: int) -> np.ndarray:
+  """Returns bool[bodies]: whether a body is ``root`` or hangs on it."""
+  inside = np.zeros(model.nbody, bool)
+  for body in range(root, model.nbody):
+    inside[body] = body == root or inside[model.body_parentid[body]]
+  return inside

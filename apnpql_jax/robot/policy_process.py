@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 import contextlib
 from importlib.metadata import version
+import json
+import math
 import os
 from pathlib import Path
 import threading
@@ -21,10 +23,13 @@ from apnpql_jax.robot.board import Board, Phase, text
 from apnpql_jax.robot.control_process import Pipe
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.limits import TIMESTEP
+from apnpql_jax.robot.orders import comes_true
 from apnpql_jax.robot.player import Act, Player
 from apnpql_jax.robot.policy_folder import PolicyFolder
+from apnpql_jax.robot.protocols import Camera
 from apnpql_jax.robot.recorder import Recorder
 from apnpql_jax.robot.replay import recorded_actions
+from apnpql_jax.robot.supervisor import CAMERAS
 
 END_S = 60.0
 """Time to write an interrupted episode after the end of the control process, s."""
@@ -114,8 +119,14 @@ def main(robot: Robot, board_name: str, options: dict[str, Any], peer: Pipe) -> 
       cameras = stack.enter_context(devices.open_cameras(robot))
       recorder = None
       if options["log"] is not None:
-        log = Recorder(Path(options["log"]), folder.contract, judged=robot.can_judge)
-        recorder = stack.enter_context(log)
+        recorder = stack.enter_context(
+          Recorder(
+            Path(options["log"]),
+            folder.contract,
+            judged=robot.can_judge,
+            devices=_described(robot, board, cameras),
+          )
+        )
       for camera in cameras:  # The first frame may take long.
         camera.get_observation()
       player = Player(robot, board, cameras, act, recorder, ending)
@@ -131,6 +142,21 @@ def main(robot: Robot, board_name: str, options: dict[str, Any], peer: Pipe) -> 
     tell(error)
   finally:
     board.close()
+
+
+def _described(robot: Robot, board: Board, cameras: Sequence[Camera]) -> dict[str, Any]:
+  """Returns what all devices say of themselves, once arm and gripper are open.
+
+  If these cannot be opened, this process ends with the control process.
+  """
+  comes_true(lambda: bool(text(board["devices"].read()["arm"])), math.inf)
+  found = board["devices"].read()
+  return {
+    "robot": robot.kind,
+    "arm": json.loads(text(found["arm"])),
+    "gripper": json.loads(text(found["gripper"])),
+    "cameras": {x: y.describe() for x, y in zip(CAMERAS, cameras, strict=True)},
+  }
 
 
 def _end_with(peer: Pipe, ready: threading.Event, ending: threading.Event) -> None:

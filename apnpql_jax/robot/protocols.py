@@ -71,7 +71,10 @@ class Device(Protocol):
     ...
 
   def describe(self) -> dict[str, Any]:
-    """Returns model, serial number and versions, for ``check`` and ``calibrate``."""
+    """Returns model, serial number, versions and settings, as JSON.
+
+    ``check`` shows them, logs and calibrations keep them.
+    """
     ...
 
 

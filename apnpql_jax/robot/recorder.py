@@ -24,13 +24,21 @@ _AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
 class Recorder:
   """Writes episodes when they end, because encoding takes longer than a period."""
 
-  def __init__(self, folder: Path, contract: dict[str, Any], *, judged: bool):
+  def __init__(
+    self,
+    folder: Path,
+    contract: dict[str, Any],
+    *,
+    judged: bool,
+    devices: dict[str, Any] | None = None,
+  ):
     """Makes the folder.
 
     Args:
       folder: Folder to make.
       contract: That of the policy.
       judged: Whether the success of an episode is known, see ``lerobot.Writer``.
+      devices: What the devices say of themselves, see ``Device.describe``.
 
     Raises:
       ConfigError: A package is missing.
@@ -57,7 +65,7 @@ class Recorder:
         for name in CAMERAS
       },
       robot_type=ROBOT_TYPE,
-      about={"contract": contract},
+      about={"contract": contract, "devices": devices or {}},
       judged=judged,
     )
 

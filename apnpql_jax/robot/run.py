@@ -11,6 +11,9 @@ import shutil
 import signal
 from typing import Any
 
+import numpy as np
+
+from apnpql_jax.atomic import replacing
 from apnpql_jax.console import print_line
 from apnpql_jax.data import lerobot
 from apnpql_jax.errors import (
@@ -23,7 +26,7 @@ from apnpql_jax.errors import (
 )
 from apnpql_jax.robot import replay
 from apnpql_jax.robot.devices import Robot
-from apnpql_jax.robot.episodes import Options, Outcome
+from apnpql_jax.robot.episodes import Home, Options, Outcome
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.session import Session
 from apnpql_jax.robot.supervisor import NO_ACTION
@@ -38,8 +41,9 @@ def run(
 ) -> dict[str, Any]:
   """Plays episodes, each from the neutral pose, and prints a line about each.
 
-  A fault ends its episode, and the next one begins, unless the arm cannot go home. On a
-  ur5e it also ends the session.
+  The arm also goes home after the last one, where its force sensor is checked. A fault
+  ends its episode, and the next one begins, unless the arm cannot go home. On a ur5e it
+  also ends the session.
 
   Returns:
     Counts, reasons, and the success rate if a simulated robot can judge it. If the
@@ -81,18 +85,29 @@ def _play(
   The arm has moved by then, so that no failure is one of bad input any more.
   """
   try:
+    _go_home(session)
     for episode in range(episodes):
-      session.go_home()
       outcomes.append(session.play())
       _report(episode, episodes, outcomes[-1])
-      _keep(options.log, outcomes[-1])
+      _keep(options.log, outcomes)
       session.check()
       if robot.kind == "ur5e" and outcomes[-1].stopped:
         # It may press on something, and would move home next.
         raise DeviceError("look at the arm after a stop, then start again")
+      try:
+        _go_home(session)
+      finally:
+        outcomes[-1] = dataclasses.replace(outcomes[-1], after=session.home)
+        _keep(options.log, outcomes)
   except (UserError, OSError) as error:
     return one_line(error)
   return ""
+
+
+def _go_home(session: Session) -> None:
+  session.go_home()
+  if reason := session.home.put_back:
+    print_line(f"the simulated robot was put back where it began: {reason}")
 
 
 @contextlib.contextmanager
@@ -145,11 +160,13 @@ def _report(episode: int, episodes: int, outcome: Outcome) -> None:
   )
 
 
-def _keep(log: str | None, outcome: Outcome) -> None:
+def _keep(log: str | None, outcomes: Sequence[Outcome]) -> None:
+  """Writes the lines of all episodes; the last one may have become longer."""
   if log is None:
     return
-  with (Path(log) / EVENTS).open("a", encoding="utf-8") as file:
-    file.write(json.dumps(dataclasses.asdict(outcome)) + "\n")
+  with replacing(Path(log) / EVENTS) as part:
+    lines = [json.dumps(dataclasses.asdict(x)) + "\n" for x in outcomes]
+    part.write_text("".join(lines), encoding="utf-8")
 
 
 def _summary(
@@ -173,8 +190,24 @@ def _summary(
       "success_rate": solved / len(judged),
       "ci95": wilson_interval(solved, len(judged)),
     }
+  found |= _at_home([x.after for x in outcomes if x.after is not None])
   if options.log is not None and outcomes:
     found["log"] = options.log
   if failure:
     found |= {"failure": failure, "exit_code": FAILED}
+  return found
+
+
+def _at_home(ways: Sequence[Home]) -> dict[str, Any]:
+  """Returns what the ways home after episodes have shown.
+
+  ``zero_error_n`` and ``zero_error_nm`` are the largest force and torque of a free hand
+  there, ``put_back`` how often a simulated robot was put back.
+  """
+  found: dict[str, Any] = {}
+  if free := [x.free for x in ways if x.free is not None]:
+    norms = np.linalg.norm(np.reshape(free, (-1, 2, 3)), axis=2).max(0)
+    found["zero_error_n"], found["zero_error_nm"] = norms.tolist()
+  if put_back := sum(x.put_back is not None for x in ways):
+    found["put_back"] = put_back
   return found

@@ -45,6 +45,10 @@ class Sensor:
     """Takes the present ``wrench`` for none, up to an error that it draws."""
     self._offset = self._error() - wrench
 
+  def drift(self, wrench: np.ndarray) -> None:
+    """Moves the zero by ``wrench``, as warming up does."""
+    self._offset = self._offset + wrench
+
   def read(self, wrench: np.ndarray) -> np.ndarray:
     """Returns a reading of the true ``wrench``."""
     return wrench + self._offset + NOISE * self._rng.normal(size=6)

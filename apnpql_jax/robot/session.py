@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import contextlib
+import dataclasses
+import functools
 import signal
 from typing import Any, Self
 
@@ -13,8 +15,8 @@ from apnpql_jax.errors import INTERRUPTED, DeviceError, RunStopped
 from apnpql_jax.robot import policy_process, simulated
 from apnpql_jax.robot.board import PERIOD_BIN_S, Board, Phase, text
 from apnpql_jax.robot.devices import Robot
-from apnpql_jax.robot.episodes import SOLVED, TIME_LIMIT, Options, Outcome
-from apnpql_jax.robot.limits import TIMESTEP, Limits
+from apnpql_jax.robot.episodes import SOLVED, TIME_LIMIT, Home, Options, Outcome
+from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.orders import Orders, comes_true
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.processes import Processes
@@ -24,7 +26,7 @@ START_S = 600.0
 """Time that the processes may take to start; programs compile on first use."""
 
 HOME_S = 60.0
-"""Time of the session that the way to the neutral pose may take."""
+"""Time of the session that the way to the neutral pose may take, or a person's help."""
 
 UNKNOWN = "the arm's controller holds; its state is unknown"
 
@@ -47,7 +49,6 @@ class Session(contextlib.AbstractContextManager):
     self._signals = signals
     self._robot, self._policy, self._options = robot, policy, options
     self._clock = robot.clock
-    self._scene = 0
     self._events: list[tuple[float, str, str]] = []
     self._failure, self._moved = "", False
     self.rest = "the arm has not moved"
@@ -55,7 +56,9 @@ class Session(contextlib.AbstractContextManager):
     self._stack = contextlib.ExitStack()
     self.board = self._stack.enter_context(Board())
     self._orders = Orders(self.board)
-    self._plant: Board | None = None
+    self._person: simulated.Person | None = None
+    self.home = Home()
+    """What came of the last ``go_home``."""
     self.processes: Processes | None = None
     """The control and the policy process."""
 
@@ -81,27 +84,27 @@ class Session(contextlib.AbstractContextManager):
     Raises:
       DeviceError: A process has ended, with its reason.
     """
-    self._wait(self._is_ready, START_S, "the robot to get ready")
+    self._wait(self._is_ready, "the robot to get ready", START_S)
 
   def go_home(self) -> None:
     """Moves the arm to the neutral pose of the policy, and the gripper as it begins.
 
-    A simulated arm that presses on something is freed first, as a person would do.
+    There, the force sensor must read what a free hand may. A simulated robot that does
+    not get there is put back where it began, as by a person, and tries again. ``home``
+    is what came of it, also after an error.
 
     Raises:
       DeviceError: It cannot get there, or a process has ended.
     """
-    policy, wait = self._policy, HOME_S * self._clock.slowdown
-    force = np.linalg.norm(self.board["state"].read()["wrench"][:3])
-    if self._plant is not None and force > Limits.hold_force:
-      self._park(self._plant)
-    begin = {"target": policy.neutral, "close": int(policy.begins_closed)}
-    self._moved = True
-    self._orders.give(Phase.HOME, **begin)
-    self._wait(lambda: self._orders.done, wait, "the arm to go home")
-    state = self.board["state"].read()
-    if state["mode"] == Mode.STOP:
-      raise DeviceError(f"no episode can begin: {text(state['reason'])}")
+    self.home = Home()
+    reason = self._try_to_go_home()
+    if reason and self._person is not None:
+      self.home = Home(put_back=reason)
+      self._person.free_arm()
+      self._person.place_objects()
+      reason = self._try_to_go_home()
+    if reason:
+      raise DeviceError(f"no episode can begin: {reason}")
 
   def play(self, watch: Callable[[Any], None] | None = None) -> Outcome:
     """Plays an episode from the neutral pose; ``watch`` gets the records "policy".
@@ -112,8 +115,8 @@ class Session(contextlib.AbstractContextManager):
     Raises:
       DeviceError: A process has ended before the episode.
     """
-    if self._plant is not None:
-      self._new_scene(self._plant)
+    if self._person is not None:
+      self._person.place_objects()
     self._take_events()
     self._events.clear()
     begin, overruns = self._clock.now(), self._overruns()
@@ -133,6 +136,7 @@ class Session(contextlib.AbstractContextManager):
       missed_periods=int(policy["missed"]),
       overruns=self._overruns() - overruns,
       dataset_index=int(policy["index"]) if policy["index"] >= 0 else None,
+      before=self.home,
     )
 
   def check(self) -> None:
@@ -145,8 +149,8 @@ class Session(contextlib.AbstractContextManager):
     self._take_events()
     self._check_signals()
     failure = self._failure or text(self.board["policy"].read()["error"])
-    if not failure and self._plant is not None:
-      failure = text(self._plant["plant"].read()["error"])
+    if not failure and self._person is not None:
+      failure = self._person.error
     ended = self._running.ended
     if failure or ended:
       # The control process first brings the arm to rest.
@@ -177,7 +181,9 @@ class Session(contextlib.AbstractContextManager):
         watch=self._check_signals,
       )
       robot = self._stack.enter_context(started)
-      self._plant = self._stack.enter_context(simulated.opened(robot))
+      plant = self._stack.enter_context(simulated.opened(robot))
+      wait = functools.partial(self._wait, seconds=HOME_S * self._clock.slowdown)
+      self._person = simulated.Person(plant, wait)
     self.processes = Processes(
       robot,
       self.board.name,
@@ -195,23 +201,17 @@ class Session(contextlib.AbstractContextManager):
       name = signal.Signals(self._signals[0]).name
       raise RunStopped(name, INTERRUPTED + self._signals[0])
 
-  def _new_scene(self, plant: Board) -> None:
-    """Places the objects of the next reset state."""
-    self._scene += 1
-    plant["scene"].write({"number": self._scene})
-    wait = 30.0 * self._clock.slowdown
-    self._wait(
-      lambda: plant["plant"].read()["scene"] == self._scene, wait, "the objects to rest"
-    )
-
-  def _park(self, plant: Board) -> None:
-    """Puts a simulated arm back where it began."""
-    number = plant["plant"].read()["parked"] + 1
-    plant["scene"].write({"parked": number})
-    wait = 30.0 * self._clock.slowdown
-    self._wait(
-      lambda: plant["plant"].read()["parked"] == number, wait, "the arm to be free"
-    )
+  def _try_to_go_home(self) -> str:
+    """Returns why the robot is not home, or an empty string; see ``go_home``."""
+    target, close = self._policy.neutral, int(self._policy.begins_closed)
+    self._moved = True
+    self._orders.give(Phase.HOME, target=target, close=close)
+    wait = HOME_S * self._clock.slowdown
+    self._wait(lambda: self._orders.done, "the arm to go home", wait)
+    state = self.board["state"].read()
+    if np.isfinite(state["free"]).all():
+      self.home = dataclasses.replace(self.home, free=state["free"].tolist())
+    return text(state["reason"]) if state["mode"] == Mode.STOP else ""
 
   def _is_ready(self) -> bool:
     state, policy = (self.board[x].read() for x in ("state", "policy"))
@@ -235,7 +235,7 @@ class Session(contextlib.AbstractContextManager):
 
     limit = 2 * self._policy.contract["time_limit_s"] + 60
     try:
-      self._wait(over, limit * self._clock.slowdown, "the episode to end")
+      self._wait(over, "the episode to end", limit * self._clock.slowdown)
     except (DeviceError, RunStopped) as error:
       return str(error), False
     reason = text(self.board["state"].read()["reason"]) if self._orders.done else ""
@@ -271,7 +271,7 @@ class Session(contextlib.AbstractContextManager):
     late = round(2 * TIMESTEP / PERIOD_BIN_S)
     return int(self.board["state"].read()["periods"][late:].sum())
 
-  def _wait(self, condition: Callable[[], bool], seconds: float, purpose: str) -> None:
+  def _wait(self, condition: Callable[[], bool], purpose: str, seconds: float) -> None:
     """Waits until a condition holds; raises what ``check`` raises."""
 
     def met() -> bool:

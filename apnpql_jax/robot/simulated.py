@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator
 import contextlib
 import dataclasses
+from importlib.metadata import version
 from multiprocessing import get_context
 from typing import Any
 
@@ -53,7 +54,7 @@ class SimulatedArm(_OnBoard):
 
   def describe(self) -> dict[str, Any]:
     """See ``Device.describe``."""
-    return {"model": "simulated UR5e"}
+    return {"model": "simulated UR5e", "mujoco": version("mujoco")}
 
   def get_observation(self) -> ArmState:
     """See ``Arm.get_observation``."""
@@ -158,6 +159,36 @@ def opened(robot: Robot) -> Generator[Board]:
   """Yields the board of a started plant, to place its objects."""
   with Board(robot.plant, RECORDS) as board:
     yield board
+
+
+class Person:
+  """What a person does at a real arm, done to a started plant."""
+
+  def __init__(self, board: Board, wait: Callable[[Callable[[], bool], str], None]):
+    """Keeps the plant's board; ``wait`` waits for a condition, which has a name."""
+    self._board, self._wait = board, wait
+    self._scene = 0
+
+  @property
+  def error(self) -> str:
+    """Why the plant has ended, if it has."""
+    return text(self._board["plant"].read()["error"])
+
+  def place_objects(self) -> None:
+    """Places the objects of the next reset state."""
+    self._scene += 1
+    self._board["scene"].write({"number": self._scene})
+    self._wait(
+      lambda: self._board["plant"].read()["scene"] == self._scene, "the objects to rest"
+    )
+
+  def free_arm(self) -> None:
+    """Puts the arm back where it began."""
+    number = self._board["plant"].read()["parked"] + 1
+    self._board["scene"].write({"parked": number})
+    self._wait(
+      lambda: self._board["plant"].read()["parked"] == number, "the arm to be free"
+    )
 
 
 def _opened(board: Board | None) -> Board:

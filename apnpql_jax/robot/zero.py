@@ -5,13 +5,15 @@ moment. A controller does not report how large the force was. So:
 
 - Before the first motion of a session the sensor is zeroed whatever it reads, because
   its offset since power-on is not known.
-- Before each episode, in the neutral pose, it is zeroed again, but only if it reads no
-  more than a free hand may. The reading shows what presses on the hand. It shows what
-  did so at the zero before, too, with the opposite sign.
+- In the neutral pose, where nothing touches the hand, the sensor must read no more than
+  a free hand may. Before each episode, it is then zeroed again. The reading shows what
+  presses on the hand, what did so at the zero before, with the opposite sign, and how
+  far the sensor has drifted since. It cannot tell these apart.
 - On the way home the last zero stays, so that a hand that presses at the end of an
   episode is felt.
 
-A force that stays on the hand from the first zero to the neutral pose is not found.
+A force that stays on the hand from the first zero to the neutral pose is not found. Nor
+is drift within an episode, which looks like a contact, before its end.
 """
 
 from __future__ import annotations
@@ -34,10 +36,27 @@ class Zero:
     """Begins with a sensor whose offset is not known."""
     self._readings: deque[np.ndarray] = deque(maxlen=_READINGS)
     self._known = False
+    self.free = np.full(6, np.nan)
+    """What the hand read at home, where it is free, f64[6], N and N m; NaN before."""
 
   def note(self, wrench: np.ndarray) -> None:
     """Takes the reading of a cycle, f64[6] in N and N m."""
     self._readings.append(wrench)
+
+  def forget(self) -> None:
+    """Drops all readings, as those of a moving arm."""
+    self._readings.clear()
+    self.free = np.full(6, np.nan)
+
+  @property
+  def is_sure(self) -> bool:
+    """Whether there are enough readings to judge."""
+    return len(self._readings) == _READINGS
+
+  def check(self) -> str:
+    """Keeps what the hand reads at home; returns why it cannot be right and free."""
+    self.free = np.mean(self._readings, axis=0)
+    return self._refusal()
 
   def start(self, arm: Arm, *, again: bool) -> str:
     """Lets an arm at rest follow commands.
@@ -54,7 +73,7 @@ class Zero:
     if not refusal:
       arm.start(zero=again or not self._known)
       self._known = True
-      self._readings.clear()  # Those before the zero; the same cycle adds a new one.
+      self.forget()  # Those before the zero; the same cycle adds a new one.
     return refusal
 
   def _refusal(self) -> str:
@@ -64,5 +83,6 @@ class Zero:
     force, torque = np.linalg.norm(mean.reshape(2, 3), axis=1)
     return (
       f"the arm reads {force:.0f} N and {torque:.1f} N m at rest before zeroing: free "
-      "the hand, or check the payload in robot.toml"
+      "the hand; if it is free, start again, as the sensor has drifted, or check the "
+      "payload in robot.toml"
     )

@@ -98,10 +98,17 @@ class Gripper(simulated.SimulatedGripper):
 class Rig:
   """Plant and control, in turns of 2 ms."""
 
-  def __init__(self, board: Board, plant_board: Board, *, seed: int = 0):
+  def __init__(
+    self,
+    board: Board,
+    plant_board: Board,
+    *,
+    seed: int = 0,
+    task_name: str = "push_plate",
+  ):
     from apnpql_jax.tasks import make_task  # Imports JAX, as no control process may.
 
-    task = make_task("push_plate")
+    task = make_task(task_name)
     self.board, self.clock = board, TurnedClock()
     self._plant_board = plant_board
     self.plant = Plant(task.scene.model, seed=seed)

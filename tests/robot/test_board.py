@@ -75,6 +75,8 @@ def test_long_text_is_cut_between_characters():
   with Board() as board:
     board["policy"].write({"error": "a" + 150 * "\u00e9"})
     assert text(board["policy"].read()["error"]) == "a" + 99 * "\u00e9"
+    board["devices"].write({"arm": 4096 * "a"})
+    assert text(board["devices"].read()["arm"]) == 4096 * "a"
 
 
 ORDERS = {

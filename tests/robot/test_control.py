@@ -66,6 +66,19 @@ def test_home_ends_with_a_gripper_that_does_not_get_there(rig, monkeypatch):
   assert GRIP_S < rig.now - begin < GRIP_S + 0.5
 
 
+def test_home_gives_a_gripper_that_was_stuck_its_time_again(rig, monkeypatch):
+  rig.go_home(closed=False)
+  rig.run_until_done()
+  with monkeypatch.context() as patch:
+    patch.setattr(motors, "gripper_torque", lambda *_, **__: 0.0)  # No power.
+    rig.go_home(closed=True)
+    rig.run_until_done()
+    assert rig.reason.startswith("gripper: still at ")
+  rig.go_home(closed=True)
+  rig.run_until_done()
+  assert rig.reason == "" and abs(rig.finger - 1.1) < THERE_RAD
+
+
 @pytest.mark.parametrize(("fails", "at_most"), [(False, 0.31), (True, 0.01)])
 def test_a_silent_gripper_stops_an_episode_in_time(rig, fails, at_most):
   rig.go_home(closed=True)

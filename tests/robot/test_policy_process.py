@@ -15,6 +15,7 @@ import threading
 from typing import Any
 from unittest import mock
 
+import mujoco
 import numpy as np
 import pytest
 from test_processes import CLOCK, NEUTRAL, is_done, rig, speed, until
@@ -41,6 +42,9 @@ class Camera:
   def __init__(self, clock: Clock, view: dict[str, Any], frames: int):
     self._clock, self._left = clock, frames
     self._image = np.zeros((view["height"], view["width"], 3), np.uint8)
+
+  def describe(self) -> dict[str, Any]:
+    return {"serial_number": f"{self._image.shape[0]} rows"}
 
   def get_observation(self) -> Frame:
     self._left -= 1
@@ -110,7 +114,14 @@ def test_an_unplugged_camera_stops_the_arm_and_its_episode_is_in_the_log(folder)
     assert (state["mode"], text(state["reason"])) == (Mode.STOP, FAULT)
     assert state["at_rest"] and FAULT in run.reasons()
     assert (found["ended"], found["index"], found["over"]) == (2, 0, 0)
-  (kept,) = lerobot.read(folder / "log").episodes
+  log, views = lerobot.read(folder / "log"), contract["cameras"]
+  assert log.about["devices"] == {
+    "robot": "double",
+    "arm": {"model": "simulated UR5e", "mujoco": mujoco.__version__},
+    "gripper": {"model": "simulated RH-P12-RN"},
+    "cameras": {x: {"serial_number": f"{views[x]['height']} rows"} for x in CAMERAS},
+  }
+  (kept,) = log.episodes
   assert len(kept.actions) == found["actions"] == FRAMES
   assert kept.success is None
 

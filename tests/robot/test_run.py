@@ -16,6 +16,7 @@ import pytest
 
 from apnpql_jax import testing
 from apnpql_jax.data import lerobot
+from apnpql_jax.robot.sensor import FREE_FORCE, load
 from apnpql_jax.testing import export_untrained
 
 ROBOT = ["--robot", "simulated", "--policy", "policy", "--slowdown", "8"]
@@ -97,7 +98,13 @@ def test_an_untrained_policy_plays_its_episodes_in_order(folder):
   assert [x["dataset_index"] for x in kept] == [0, 1]
   for episode in kept:
     check_events(episode)
-  first = lerobot.read(folder / "log").episodes[0]
+    assert load(np.array(episode["after"]["free"])) <= 1
+  assert kept[1]["before"] == kept[0]["after"]
+  assert 0 < found["zero_error_n"] <= FREE_FORCE
+  log = lerobot.read(folder / "log")
+  assert log.about["devices"]["robot"] == "simulated"
+  assert [*log.about["devices"]["cameras"]] == ["global", "wrist"]
+  first = log.episodes[0]
   assert len(first.actions) == kept[0]["actions"]
   assert np.abs(first.actions[:, :6]).max() <= 1
 

@@ -19,7 +19,11 @@ from test_run import folder, is_orderly, start, this_checkout  # noqa: F401
 from apnpql_jax.data import lerobot
 from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot import doubles
+from apnpql_jax.robot.doubles.controller import SERIAL, VERSION
+from apnpql_jax.robot.doubles.dynamixel import FIRMWARE
+from apnpql_jax.robot.doubles.plant import DRIFT
 from apnpql_jax.robot.doubles.server import ask
+from apnpql_jax.robot.drivers.rh_p12_rn import RNA
 
 pytestmark = pytest.mark.slow
 
@@ -55,6 +59,18 @@ def is_in_time(found: dict) -> bool:
   return not found["overruns"] and not found["missed_periods"]
 
 
+def check_devices(found: dict) -> None:
+  """Checks that a log names the devices of its session."""
+  assert found["robot"] == "double"
+  assert found["arm"]["serial_number"] == SERIAL
+  assert found["arm"]["polyscope"] == ".".join(map(str, VERSION))
+  gripper = found["gripper"]
+  assert (gripper["model"], gripper["firmware"]) == (RNA.name, FIRMWARE)
+  for name, camera in found["cameras"].items():
+    assert camera["serial_number"] == f"double-{name}"
+    assert camera["firmware"] and camera["stream"] and camera["lens"]
+
+
 def test_a_policy_plays_and_its_log_is_whole(folder):  # noqa: F811
   for attempt in range(TRIES):
     log = folder / f"doubled-{attempt}"
@@ -70,7 +86,9 @@ def test_a_policy_plays_and_its_log_is_whole(folder):  # noqa: F811
   (line,) = episodes(log)
   assert line["solved"] is None and line["dataset_index"] == 0
   assert (line["reason"], line["actions"]) == (reason, found["actions"])
-  (kept,) = lerobot.read(log).episodes
+  dataset = lerobot.read(log)
+  check_devices(dataset.about["devices"])
+  (kept,) = dataset.episodes
   assert kept.success is None and len(kept.actions) == line["actions"]
   if reason == "time limit":
     assert len(kept.actions) == 16 - line["missed_periods"]
@@ -110,6 +128,25 @@ def test_a_fault_ends_the_session_with_its_episode_in_the_log(folder, fault):  #
     pytest.skip(f"the machine is too busy: {errors}")
   dataset = lerobot.read(log).episodes
   assert len(dataset[hit[0]["dataset_index"]].actions) == hit[0]["actions"] > 0
+
+
+def test_a_sensor_that_drifts_in_an_episode_ends_the_session_after_it(folder):  # noqa: F811
+  for attempt in range(TRIES):
+    log = folder / f"drift-{attempt}"
+    process = start(*ROBOT, "--episodes", "50", "--log", log.name, cwd=folder)
+    host = doubles.address(process.pid, 0)
+    if moving := wait_for_an_action(host, process):
+      ask(host, "drift_force")
+    found, errors = finish(process)
+    assert found["exit_code"] == 3 and found["failure"], errors
+    if moving and "before zeroing: free the hand" in found["failure"]:
+      break
+    assert not moving or not is_in_time(found), found
+  else:
+    pytest.skip(f"the machine is too busy: {errors}")
+  after = episodes(log)[-1]["after"]
+  np.testing.assert_allclose(after["free"], DRIFT, atol=1.0)
+  assert found["zero_error_n"] == pytest.approx(np.linalg.norm(after["free"][:3]))
 
 
 def wait_for_an_action(host: str, process: subprocess.Popen[str]) -> bool:

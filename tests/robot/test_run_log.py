@@ -1,8 +1,12 @@
-"""The folder of a log: new for each session, and gone if no episode was played."""
+"""The folder of a log: new for each session, gone if no episode was played.
+
+And what its lines say about the ways home.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import json
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +17,7 @@ from apnpql_jax.errors import DeviceError, FileError, RunStopped
 from apnpql_jax.robot import run
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.devices import Robot
-from apnpql_jax.robot.episodes import Options
+from apnpql_jax.robot.episodes import Home, Options, Outcome
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.recorder import Recorder
 
@@ -23,6 +27,10 @@ FAILURES = (
   (DeviceError("camera wrist: sent no frame for 5.0 s"), DeviceError),
   (RunStopped("SIGINT", 130), RunStopped),
 )
+
+
+FREE = [1.0, 0.0, 0.0, 0.0, 0.0, 0.1]
+PRESSED = [0.0, 0.0, -14.0, 0.0, 0.0, 0.2]
 
 
 class Failing(contextlib.nullcontext):
@@ -42,10 +50,10 @@ class Failing(contextlib.nullcontext):
       raise self.error
 
 
-def play(log: Path) -> None:
+def play(log: Path, episodes: int = 1) -> dict[str, Any]:
   policy = PolicyFolder(Path("policy"), CONTRACT)
   robot = Robot("double", CONTRACT, Cell())
-  run.run(robot, policy, Options(log=str(log)), episodes=1)
+  return run.run(robot, policy, Options(log=str(log)), episodes=episodes)
 
 
 @pytest.mark.parametrize(("error", "kind"), FAILURES)
@@ -63,3 +71,54 @@ def test_a_folder_that_exists_is_left_alone(tmp_path):
   with pytest.raises(FileError, match="exists; name another folder with --log"):
     play(tmp_path)
   assert (tmp_path / "mine").exists()
+
+
+class Drifting(contextlib.nullcontext):
+  """A session whose second way home needs help, and whose third one shows drift."""
+
+  rest = "the arm is at rest"
+
+  def __init__(self, robot: Robot, policy: Any, options: Options, signals: Any):
+    super().__init__()
+    del robot, policy, options, signals
+    self.home = Home()
+    self._ways = iter([Home(FREE), Home(FREE, "gripper: still"), Home(PRESSED)])
+
+  def __enter__(self) -> Drifting:
+    return self
+
+  def wait_until_ready(self) -> None: ...
+
+  def check(self) -> None: ...
+
+  def go_home(self) -> None:
+    self.home = next(self._ways)
+    if self.home.free == PRESSED:
+      raise DeviceError("no episode can begin: the arm reads 14 N")
+
+  def play(self) -> Outcome:
+    return Outcome(None, "time limit", 5, 1.0, [], before=self.home)
+
+
+def test_each_line_has_what_both_ways_home_have_shown(tmp_path, monkeypatch, capsys):
+  monkeypatch.setattr(run, "Session", Drifting)
+  found = play(tmp_path / "log", episodes=4)
+  lines = (tmp_path / "log" / run.EVENTS).read_text().splitlines()
+  first, second = (json.loads(line) for line in lines)
+  freed = {"free": FREE, "put_back": "gripper: still"}
+  assert (first["before"], first["after"]) == ({"free": FREE, "put_back": None}, freed)
+  assert second["before"] == freed
+  assert second["after"] == {"free": PRESSED, "put_back": None}
+  assert (found["zero_error_n"], found["zero_error_nm"]) == (14.0, 0.2)
+  assert (found["put_back"], found["exit_code"], found["episodes"]) == (1, 3, 2)
+  shown = capsys.readouterr().err
+  assert "the simulated robot was put back where it began: gripper: still" in shown
+  assert "ends after 2 of 4 episodes: no episode can begin: the arm reads 14 N" in shown
+
+
+def test_the_arm_goes_home_after_the_last_episode(tmp_path, monkeypatch):
+  monkeypatch.setattr(run, "Session", Drifting)
+  found = play(tmp_path / "log", episodes=1)
+  (line,) = (tmp_path / "log" / run.EVENTS).read_text().splitlines()
+  assert json.loads(line)["after"]["free"] == FREE
+  assert "failure" not in found and found["episodes"] == 1

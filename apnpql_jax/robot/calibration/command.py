@@ -94,20 +94,9 @@ def calibrate(
       raise ConfigError("cameras without an arm give no views")
     for name, camera in cameras.items():
       views.record(folder / name, kind, arm, camera, ask=ask)
-  found: dict[str, _Found] = {}
-  for name in _names(contract, folder):
-    try:
-      if serials is not None:
-        views.check_serial(folder / name, serials[name])
-      found[name] = _calibrate_one(contract, name, folder / name, kind, board_on, found)
-    except UserError as error:
-      raise type(error)(f"{name} camera: {error}") from None
+  found = _calibrate_each(contract, folder, kind, board_on, serials)
   pictures = [_picture(contract, name, x, out) for name, x in found.items()]
-  checked = {}
-  for name, x in found.items():
-    difference = limits.check(contract, name, x.camera.pose, x.camera.lens)
-    about = x.camera.about | {"difference": difference.to_json()}
-    checked[name] = dataclasses.replace(x.camera, about=about)
+  checked = {name: _checked(contract, name, x.camera) for name, x in found.items()}
   kept = {} if earlier is None else dict(earlier.cameras)
   files.save(
     out,
@@ -139,6 +128,38 @@ def _names(contract: Json, folder: Path) -> list[str]:
     wanted = " or ".join(str(folder / name) for name in known)
     raise FileError(f"there are no views in {wanted}")
   return names
+
+
+def _calibrate_each(
+  contract: Json,
+  folder: Path,
+  board: Board,
+  board_on: str,
+  serials: Mapping[str, str] | None,
+) -> dict[str, _Found]:
+  """Returns the cameras with views, by name; errors begin with the name."""
+  found: dict[str, _Found] = {}
+  for name in _names(contract, folder):
+    try:
+      if serials is not None:
+        views.check_serial(folder / name, serials[name])
+      found[name] = _calibrate_one(
+        contract, name, folder / name, board, board_on, found
+      )
+    except UserError as error:
+      raise type(error)(f"{name} camera: {error}") from None
+  return found
+
+
+def _checked(contract: Json, name: str, camera: CalibratedCamera) -> CalibratedCamera:
+  """Returns a camera with its difference from the contract.
+
+  Raises:
+    ConfigError: The camera is not where the policy was trained for.
+  """
+  difference = limits.check(contract, name, camera.pose, camera.lens)
+  about = camera.about | {"difference": difference.to_json()}
+  return dataclasses.replace(camera, about=about)
 
 
 def _calibrate_one(
@@ -188,7 +209,7 @@ def _calibrate_one(
 
 def _picture(contract: Json, name: str, found: _Found, out: Path) -> Path | None:
   """Writes the picture of a view, or prints why there is none; returns its path."""
-  path, pictures = out.with_name(f"{out.stem}_{name}.png"), []
+  path = out.with_name(f"{out.stem}_{name}.png")
   # Of the views that were used, that with the most corners.
   kept = np.flatnonzero(found.solution.kept)
   best = max(kept, key=lambda i: len(found.problem.seen[i].ids))
@@ -209,8 +230,8 @@ def _picture(contract: Json, name: str, found: _Found, out: Path) -> Path | None
       found.views.joints[found.rows[best]],
       corners,
     )
-    pictures.append(path)
-  return pictures[0] if pictures else None
+    return path
+  return None
 
 
 def _summary(about: Json) -> Json:

@@ -9,6 +9,7 @@ from typing import Any
 
 from apnpql_jax.robot.calibration.boards import Board
 from apnpql_jax.robot.calibration.command import calibrate
+from apnpql_jax.robot.devices import connected
 
 Json = dict[str, Any]
 
@@ -63,6 +64,5 @@ def calibrate_cell(
   }
   with contextlib.ExitStack() as stack:
     for device in (arm, *cameras.values()):
-      device.connect()
-      stack.callback(device.disconnect)
+      stack.enter_context(connected(device))
     return calibrate(contract, folder, out, arm=arm, cameras=cameras, **options)

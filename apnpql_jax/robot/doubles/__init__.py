@@ -12,10 +12,11 @@ import itertools
 import os
 from typing import Any
 
+from apnpql_jax.robot.devices import connected
 from apnpql_jax.robot.doubles.cameras import cameras
 from apnpql_jax.robot.doubles.child import Child
 from apnpql_jax.robot.doubles.server import ask
-from apnpql_jax.robot.drivers.gripper import RHP12RN, connect
+from apnpql_jax.robot.drivers.gripper import RHP12RN
 from apnpql_jax.robot.drivers.realsense import RealSense
 from apnpql_jax.robot.drivers.rh_p12_rn import RNA
 from apnpql_jax.robot.drivers.ur5e import UR5e
@@ -53,6 +54,10 @@ class Doubles:
     """Ends the program on the controller, as the teach pendant can."""
     ask(self.host, "stop_program")
 
+  def drift_force(self) -> None:
+    """Moves the zero of the force-torque sensor."""
+    ask(self.host, "drift_force")
+
   def silence_gripper(self) -> None:
     """Makes the gripper ignore its bus, as without power."""
     ask(self.host, "silence_gripper")
@@ -89,14 +94,10 @@ def start(
     stack.callback(server.close)
     host, terminal = server.greeting
     arm = UR5e(host, payload_kg=PAYLOAD_KG, payload_cog_m=PAYLOAD_COG_M)
-    arm.connect()
-    stack.callback(arm.disconnect)
-    gripper = connect(terminal)
-    stack.callback(gripper.disconnect)
+    gripper = RHP12RN(terminal)
     eyes = stack.enter_context(cameras(host, task, contract)) if contract else {}
-    for camera in eyes.values():
-      camera.connect()
-      stack.callback(camera.disconnect)
+    for device in (arm, gripper, *eyes.values()):
+      stack.enter_context(connected(device))
     yield Doubles(host, arm, gripper, eyes)
 
 

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from apnpql_jax.robot.doubles.plant import JOINTS, World
+from apnpql_jax.robot.arm_model import JOINTS
+from apnpql_jax.robot.doubles.plant import World
 from apnpql_jax.robot.limits import TIMESTEP
 
 VERSION = (5, 25, 1, 130182)

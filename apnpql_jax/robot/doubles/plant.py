@@ -16,15 +16,17 @@ import mujoco
 import numpy as np
 
 from apnpql_jax.config import files
+from apnpql_jax.robot.arm_model import BASE, FLANGE, JOINTS
 from apnpql_jax.robot.limits import TIMESTEP
+from apnpql_jax.robot.plant import subtree
 
-JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 FINGER = "finger_r1"
 SPEED_LIMIT = math.pi  # rad/s, the UR5e's joints, data sheet
 STIFFNESS, DAMPING = 1e4, 200.0  # 1/s^2, 1/s: critically damped at 16 Hz
 DEVIATION_LIMIT = 0.15  # rad between target and joint, beyond which the arm stops
 FORCE_LIMIT = 150.0  # N on the tool: the default of the safety settings
 BIAS = np.array([2.0, -1.5, 3.0, 0.1, -0.2, 0.05])  # N, N m: of the sensor when on
+DRIFT = np.array([6.0, 0.0, -10.0, 0.0, 0.3, 0.0])  # N, N m: of ``World.drift``
 NOISE = np.array([0.3, 0.3, 0.3, 0.01, 0.01, 0.01])  # N, N m: standard deviations
 REFERENCE_GAIN = 300.0
 
@@ -49,16 +51,16 @@ class World:
     finger = model.joint(FINGER)
     self._finger, self._finger_dof = int(finger.qposadr[0]), int(finger.dofadr[0])
     self._gripper = model.body("gripper").id
-    self._tool = _subtree(model, self._gripper)
+    self._tool = subtree(model, self._gripper)
     self._weight = model.body_subtreemass[self._gripper] * model.opt.gravity
-    self._flange, self._base = data.site("attachment_site"), data.site("base_frame")
+    self._flange, self._base = data.site(FLANGE), data.site(BASE)
     self._mass = np.zeros((model.nv, model.nv))
     self._block = np.ix_(self._dofs, self._dofs)
     self._goal, self._lag = self.position, TIMESTEP
     self.lock()
     self._finger_goal, self._finger_speed, self._grip = self.finger, 0.0, 0.0
     self._rng = np.random.default_rng(0) if noise else None
-    self._zero = np.zeros(6)
+    self._bias, self._zero = BIAS, np.zeros(6)
     self._payload = 0.0, np.zeros(3)
     mujoco.mj_forward(model, data)
     self.wrench = self._measure()
@@ -119,6 +121,10 @@ class World:
     """Makes the present wrench the origin of its measurement."""
     self._zero = self._measure() + self._zero
 
+  def drift(self) -> None:
+    """Moves the zero of the wrench by ``DRIFT``, as warming up does, but at once."""
+    self._bias = self._bias + DRIFT
+
   def step(self) -> str:
     """Advances by 2 ms; returns why the controller would stop the arm, or ""."""
     self._smooth()
@@ -168,7 +174,8 @@ class World:
     frame = self._flange.xmat.reshape(3, 3)
     wrench -= _moment(mass * self.model.opt.gravity, frame @ at)
     base = self._base.xmat.reshape(3, 3)
-    turned = np.concatenate([wrench[:3] @ base, wrench[3:] @ base]) + BIAS - self._zero
+    turned = np.concatenate([wrench[:3] @ base, wrench[3:] @ base])
+    turned += self._bias - self._zero
     return turned + NOISE * self._rng.normal(size=6) if self._rng else turned
 
   def _contact(self) -> np.ndarray:
@@ -200,11 +207,3 @@ def _clipped(value: float, limit: float) -> float:
 def _moment(force: np.ndarray, arm: np.ndarray) -> np.ndarray:
   (x, y, z), (a, b, c) = arm, force
   return np.array([a, b, c, y * c - z * b, z * a - x * c, x * b - y * a])
-
-
-def _subtree(model: mujoco.MjModel, root: int) -> np.ndarray:
-  """Returns bool[bodies]: whether a body hangs on ``root``."""
-  inside = np.zeros(model.nbody, bool)
-  for body in range(root, model.nbody):
-    inside[body] = body == root or inside[model.body_parentid[body]]
-  return inside

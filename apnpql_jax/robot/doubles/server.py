@@ -183,6 +183,10 @@ class Remote:
     self.drop_rtde = server.drop
     self._cameras = True
 
+  def drift_force(self) -> None:
+    """Moves the zero of the force-torque sensor."""
+    self._plant.drift()
+
   def silence_gripper(self) -> None:
     """Makes the gripper ignore its bus."""
     self._gripper.silent = True

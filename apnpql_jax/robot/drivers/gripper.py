@@ -36,17 +36,6 @@ _PERIOD = 0.005  # s between two readings at least
 _ERROR_PERIOD = 0.5  # s between two readings of the hardware error status
 
 
-def connect(port: str, **settings: Any) -> RHP12RN:
-  """Returns the gripper at a serial port, connected; ``settings`` as of ``RHP12RN``.
-
-  Raises:
-    DeviceError: See ``RHP12RN.connect``.
-  """
-  gripper = RHP12RN(port, **settings)
-  gripper.connect()
-  return gripper
-
-
 class RHP12RN:
   """A ``Gripper`` on a serial port."""
 

@@ -111,7 +111,9 @@ class RealSense:
 
   def describe(self) -> Json:
     """See ``protocols.Device``."""
-    return {**self._about, "lens": self._lens}
+    height, width, rate = self._mode
+    stream = f"{width}x{height} at {rate}/s"
+    return {**self._about, "stream": stream, "lens": self._lens}
 
   def get_observation(self) -> Frame:
     """See ``protocols.Camera``.

@@ -19,7 +19,7 @@ import pytest
 from apnpql_jax.config import files
 from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot import doubles
-from apnpql_jax.robot.doubles.dynamixel import crc
+from apnpql_jax.robot.doubles.dynamixel import FIRMWARE, crc
 from apnpql_jax.robot.doubles.modbus import crc as modbus_crc
 from apnpql_jax.robot.doubles.server import ask
 from apnpql_jax.robot.drivers import buses, gripper as driver
@@ -53,10 +53,16 @@ def bench(**settings) -> Generator[tuple[str, str]]:
   server.close()
 
 
+def connect(port: str) -> driver.RHP12RN:
+  gripper = driver.RHP12RN(port)
+  gripper.connect()
+  return gripper
+
+
 @contextlib.contextmanager
 def held(port: str) -> Generator[driver.RHP12RN]:
   """The connected gripper."""
-  gripper = driver.connect(port)
+  gripper = connect(port)
   yield gripper
   gripper.disconnect()
 
@@ -119,6 +125,7 @@ def test_the_model_is_identified_and_opens_and_closes(number, bus):
     about = gripper.describe()
     found = about["model"], about["model_number"], about["bus"]
     assert found == (MODELS[number], number, bus)
+    assert about["firmware"] == FIRMWARE
     for close, angle in ((False, 0.0), (True, 1.1), (False, 0.0)):
       gripper.send_action(close)
       gripper.send_action(close)  # Changes nothing.
@@ -288,7 +295,7 @@ def test_a_hardware_error_is_one_line():
         gripper.get_observation()
         time.sleep(0.01)
     with pytest.raises(DeviceError, match="it is overloaded; turn it off and on"):
-      driver.connect(port)
+      connect(port)
 
 
 def test_another_dynamixel_is_one_line():
@@ -296,7 +303,7 @@ def test_another_dynamixel_is_one_line():
     bench(model_number=1020) as (_, port),
     pytest.raises(DeviceError, match=r"number 1020, not RH-P12-RN \(35073\) or"),
   ):
-    driver.connect(port)
+    connect(port)
 
 
 @pytest.mark.parametrize("echo", [False, True])
@@ -313,7 +320,7 @@ def test_a_port_without_a_gripper_is_one_line(echo):
   threading.Thread(target=answer, daemon=True).start()
   begin = time.monotonic()
   with pytest.raises(DeviceError, match="nothing answers at /dev/pts") as error:
-    driver.connect(os.ttyname(theirs))
+    connect(os.ttyname(theirs))
   assert time.monotonic() - begin < 3
   assert "\n" not in str(error.value)
   os.close(theirs)
@@ -335,7 +342,7 @@ def test_a_refusal_by_modbus_closes_the_port():
   threading.Thread(target=refuse, daemon=True).start()
   before = len(opened(port))
   with pytest.raises(DeviceError, match="it refuses register 0") as error:
-    driver.connect(port)
+    connect(port)
   assert len(opened(port)) == before == 1, error  # Whose frames keep the bus.
   os.close(theirs)
 
@@ -351,12 +358,12 @@ def opened(port: str) -> list[Path]:
 
 def test_a_missing_port_or_package_is_one_line(monkeypatch):
   with pytest.raises(DeviceError) as error:
-    driver.connect("/dev/nothing")
+    connect("/dev/nothing")
   message = "gripper: could not open port /dev/nothing: No such file or directory"
   assert str(error.value) == message
   monkeypatch.setitem(sys.modules, "dynamixel_sdk", None)
   with pytest.raises(DeviceError, match="robot needs dynamixel-sdk: pip install"):
-    driver.connect("/dev/nothing")
+    connect("/dev/nothing")
 
 
 def test_the_checksums_are_those_of_the_protocols():

@@ -107,7 +107,9 @@ def test_the_lens_is_that_of_the_camera_or_the_given_one():
     assert (lens["height"], lens["width"]) == SIZE
     assert lens["fx"] == pytest.approx(double.focal)
     about = camera.describe()
-  assert "D435" in about["model"] and about["serial_number"] == double.serial
+    assert "D435" in about["model"] and about["serial_number"] == double.serial
+  assert (about["firmware"], about["stream"]) == ("0.0.0.0", f"424x240 at {RATE}/s")
+  assert about["lens"] == lens
   with connected(lens={**lens, "cx": 210.0}) as (_, camera):
     assert camera.lens()["cx"] == 210.0
 

@@ -16,6 +16,8 @@ import pytest
 
 from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot import doubles
+from apnpql_jax.robot.doubles.controller import SERIAL, VERSION
+from apnpql_jax.robot.doubles.plant import DRIFT
 from apnpql_jax.robot.drivers.ur5e import UR5e
 from apnpql_jax.robot.limits import TIMESTEP
 
@@ -109,6 +111,14 @@ def test_start_keeps_the_zero_if_asked_to():
     devices.arm.stop()
     devices.arm.start()
     assert np.linalg.norm(devices.arm.get_observation().wrench) < 1e-3
+
+
+def test_the_zero_of_the_wrench_drifts_until_the_next_one(rig):
+  rig.drift_force()
+  rig.arm.stop()
+  np.testing.assert_allclose(rig.arm.get_observation().wrench, DRIFT, atol=1e-3)
+  rig.arm.start()
+  assert np.linalg.norm(rig.arm.get_observation().wrench) < 1e-3
 
 
 def test_the_table_pushes_the_tool_up(rig):
@@ -215,8 +225,9 @@ def test_a_slowed_arm_does_not_start():
 
 def test_describe_names_device_and_versions(rig):
   about = rig.arm.describe()
-  assert about["model"] == "UR5e" and about["serial_number"]
-  assert about["polyscope"].startswith("5.")
+  assert (about["model"], about["serial_number"]) == ("UR5e", SERIAL)
+  assert about["polyscope"] == ".".join(map(str, VERSION))
+  assert about["payload_kg"] == doubles.PAYLOAD_KG
 
 
 def _silent(client: socket.socket) -> None:

@@ -1,0 +1,152 @@
+"""The way home of a session, whose simulated robot may need help.
+
+Session, control and plant are the real ones; a thread turns the clock of the rig.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+import contextlib
+import functools
+from pathlib import Path
+import re
+import threading
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import rigs
+from rigs import NEUTRAL
+
+from apnpql_jax.errors import DeviceError
+from apnpql_jax.robot.board import Board
+from apnpql_jax.robot.cell import Cell
+from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.episodes import Home, Options
+from apnpql_jax.robot.hand import THERE_RAD
+from apnpql_jax.robot.policy_folder import PolicyFolder
+from apnpql_jax.robot.sensor import load
+from apnpql_jax.robot.session import Session
+from apnpql_jax.robot.simulated import Person
+from apnpql_jax.robot.simulation import RECORDS
+from apnpql_jax.sim import motors
+
+CONTRACT: dict[str, Any] = {
+  "task": "stack_box",
+  "joints": {
+    "neutral": [*NEUTRAL, 1.1],
+    "gripper": {"open_rad": 0.0, "closed_rad": 1.1},
+  },
+}
+JAM = re.compile(r"gripper: still at 0\.\d\d rad after 3 s")
+POLICY = PolicyFolder(Path("policy"), CONTRACT)
+
+
+class Rig(rigs.Rig):
+  """A rig that may have a box between its fingers, until a person takes it out."""
+
+  jammed = False
+
+  def step(self, seconds: float) -> None:
+    if self.jammed and not self.objects_placed:
+      self.hold_box()
+    super().step(seconds)
+
+  @property
+  def objects_placed(self) -> int:
+    """How often a person has placed the objects."""
+    return int(self._plant_board["scene"].read()["number"])
+
+  def open_fingers(self) -> None:
+    """Opens them without the control process."""
+    while self.finger > 0.01:
+      self.plant.step(None, close=False)
+
+  def hold_box(self) -> None:
+    """Keeps a box where the fingers would close."""
+    data, joint = self.plant.data, self.plant.model.body("yellow").jntadr[0]
+    at = self.plant.model.jnt_qposadr[joint]
+    data.qpos[at : at + 3] = data.site("tool").xpos
+    data.qvel[self.plant.model.jnt_dofadr[joint] :][:6] = 0.0
+
+
+@contextlib.contextmanager
+def playing(*, person: bool) -> Generator[tuple[Session, Rig]]:
+  """Yields a session between two episodes, and its rig, whose clock runs.
+
+  Its fingers are open and begin an episode closed.
+  """
+  session = Session(Robot("simulated", CONTRACT, Cell()), POLICY, Options())
+  processes: Any = SimpleNamespace(ended=[], events=list)
+  session.processes, over = processes, threading.Event()
+  with contextlib.ExitStack() as stack:
+    board = stack.enter_context(Board(records=RECORDS))
+    rig = Rig(session.board, board, task_name="stack_box")
+    rig.open_fingers()
+    if person:
+      wait = functools.partial(session._wait, seconds=60.0)
+      session._person = Person(board, wait)
+
+    def turn() -> None:
+      while not over.is_set():
+        rig.turn()
+
+    thread = threading.Thread(target=turn)
+    thread.start()
+    try:
+      yield session, rig
+    finally:
+      over.set()
+      thread.join()
+      session.processes = None
+      session.close()
+
+
+@pytest.mark.parametrize("person", [True, False])
+def test_a_robot_that_gets_home_needs_no_help(person):
+  with playing(person=person) as (session, rig):
+    session.go_home()
+    free = session.home.free
+    assert free is not None and load(np.array(free)) <= 1
+    assert session.home == Home(free=free)
+    assert rig.objects_placed == 0
+
+
+def test_a_jammed_gripper_of_a_simulated_robot_is_freed():
+  with playing(person=True) as (session, rig):
+    rig.jammed = True
+    session.go_home()
+    assert session.home.put_back is not None
+    assert JAM.fullmatch(session.home.put_back)
+    assert session.home.free is not None
+    assert abs(rig.finger - 1.1) < THERE_RAD
+    assert rig.objects_placed == 1
+    session.go_home()
+    assert session.home.put_back is None
+
+
+def test_a_gripper_that_does_not_move_again_ends_the_session(monkeypatch):
+  monkeypatch.setattr(motors, "gripper_torque", lambda *_, **__: 0.0)  # No power.
+  with playing(person=True) as (session, rig):
+    with pytest.raises(DeviceError, match=f"no episode can begin: {JAM.pattern}"):
+      session.go_home()
+    assert session.home.put_back is not None and session.home.free is None
+    assert rig.objects_placed == 1
+
+
+def test_nobody_frees_a_real_gripper():
+  with playing(person=False) as (session, rig):
+    rig.jammed = True
+    with pytest.raises(DeviceError, match=f"no episode can begin: {JAM.pattern}"):
+      session.go_home()
+    assert session.home == Home()
+
+
+def test_a_sensor_that_has_drifted_ends_the_session_and_is_recorded():
+  with playing(person=True) as (session, rig):
+    session.go_home()
+    rig.plant.sensor.drift(np.array([0, 0, 20.0, 0, 0, 0]))
+    with pytest.raises(DeviceError, match="no episode can begin: the arm reads"):
+      session.go_home()
+    assert session.home.free is not None and session.home.free[2] > 12
