@@ -10,6 +10,7 @@ import ablations
 from comparison import PAPER, TASKS, Comparison
 import pixel_comparison
 import pytest
+import search
 import state_comparison
 
 from apnpql_jax.agents.table_one import epsilon_bounds
@@ -19,11 +20,13 @@ from apnpql_jax.config.files import config_diff
 COMPARISONS = [state_comparison.COMPARISON, pixel_comparison.COMPARISON]
 RUNS = [
   (comparison, task, row)
-  for comparison in (*COMPARISONS, ablations.COMPARISON)
+  for comparison in (*COMPARISONS, search.COMPARISON, ablations.COMPARISON)
   for task, row in itertools.product(comparison.tasks, comparison.rows)
 ]
 
-by_folder = pytest.mark.parametrize("comparison", COMPARISONS, ids=lambda x: x.out.name)
+by_folder = pytest.mark.parametrize(
+  "comparison", [*COMPARISONS, search.COMPARISON], ids=lambda x: x.out.name
+)
 
 
 @pytest.mark.parametrize(("comparison", "task", "row"), RUNS)
@@ -33,7 +36,7 @@ def test_settings_of_a_run_are_accepted(comparison: Comparison, task: str, row: 
   assert config.total_steps % config.eval_every == 0
 
 
-@by_folder
+@pytest.mark.parametrize("comparison", COMPARISONS, ids=lambda x: x.out.name)
 @pytest.mark.parametrize("task", TASKS)
 def test_rows_of_the_paper_differ_in_the_algorithm_and_its_own_settings(
   comparison: Comparison, task: str
@@ -51,6 +54,25 @@ def test_rows_with_a_mixture_differ_only_in_its_components(row: str):
   one, three = (comparison.config_of("push_plate", x, 0) for x in (row, mixture))
   assert config_diff(one, three) == {"agent.policy_components": (1, 3)}
   assert mixture not in comparison.wanted
+
+
+@pytest.mark.parametrize("row", PAPER)
+def test_trials_of_a_search_change_as_many_settings_in_every_row(row: str):
+  comparison, space = search.COMPARISON, search.SPACES[row]
+  assert {len(x) for x in search.SPACES.values()} == {4}
+  first, *trials = (
+    comparison.config_of("push_plate", f"{row}_{i}", 0)
+    for i in range(search.TRIALS + 1)
+  )
+  assert not config_diff(
+    first, pixel_comparison.COMPARISON.config_of("push_plate", row, 0)
+  )
+  for trial in trials:
+    names = {name: f"agent.{name.replace('-', '_')}" for name in space}
+    assert config_diff(first, trial).keys() == {*names.values()}
+    for name, (low, high) in space.items():
+      value = getattr(trial.agent, name.replace("-", "_"))
+      assert 0.95 * low <= value <= 1.05 * high  # Two digits are kept.
 
 
 @pytest.mark.parametrize("task", ablations.COMPARISON.tasks)
@@ -92,7 +114,7 @@ def test_the_curves_are_drawn_from_the_stored_results(comparison, tmp_path):
 
 @by_folder
 def test_a_result_of_other_settings_is_refused(comparison: Comparison, tmp_path):
-  stored = next(comparison.out.glob("*-ap_npql-*.json"))
+  stored = next(comparison.out.glob("*.json"))
   result = json.loads(stored.read_text())
   result["config"]["agent"]["gamma"] = 0.9
   (tmp_path / stored.name).write_text(json.dumps(result))
