@@ -36,7 +36,7 @@ Sizes = dict[str, tuple[int, int]]  # height and width of the images, by camera
 
 RESOLUTIONS: dict[str, Sizes] = {
   "paper": {"global": (72, 96), "wrist": (36, 64)},
-  "sim_to_real": {"global": (120, 160), "wrist": (60, 107)},
+  "real_robot": {"global": (120, 160), "wrist": (60, 107)},
   "tiny": {"global": (12, 16), "wrist": (8, 12)},
 }
 OTHERS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -51,7 +51,7 @@ def main() -> None:
   parser = command.parser(__doc__, repeats=15)
   flag = parser.add_argument
   flag("--alone", action="store_true", help="without the other renderers")
-  names = ["paper", "sim_to_real"]
+  names = ["paper", "real_robot"]
   flag("--resolutions", nargs="+", choices=RESOLUTIONS, default=names)
   flag("--batch", type=int, nargs="+", default=[1, 8, 16, 32, 64, 128, 256])
   flag("--shadow", type=int, nargs="*", default=[64], help="batches with a shadow, too")
