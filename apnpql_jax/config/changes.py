@@ -32,9 +32,10 @@ OF_WEIGHTS = (
   "agent.temperature agent.diagonal_covariance agent.policy_components agent.hidden "
   "agent.num_atoms agent.feature_dim agent.patch_channels agent.conv_channels "
   "agent.conv_overlap agent.residual_blocks agent.lstm_instants "
-  "agent.global_features agent.wrist_features env.obs env.global_size env.wrist_size"
+  "agent.standardize_images agent.global_features agent.wrist_features env.obs "
+  "env.global_size env.wrist_size"
 ).split()
-"""Settings that decide which arrays the weights are."""
+"""Settings that decide which arrays the weights are, or what they read."""
 
 
 def check_resumed(saved: TrainConfig, wanted: TrainConfig, run: str) -> None:

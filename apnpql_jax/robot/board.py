@@ -48,8 +48,8 @@ class Phase(enum.IntEnum):
 RECORDS = {
   # From the main process.
   "order": [("number", "i8"), ("phase", "i8"), ("target", "f8", 6), ("close", "i8")],
-  # From the control process; "number" is that of the order that "phase" obeys, "free"
-  # the wrench that the free hand has read at home, NaN on the way.
+  # From the control process; "number" is that of the order that "phase" obeys,
+  # "unloaded" the wrench that the hand has read at home, NaN on the way.
   "state": [
     ("number", "i8"),
     ("phase", "i8"),
@@ -64,10 +64,10 @@ RECORDS = {
     ("reason", TEXT),
     ("done", "i8"),
     ("at_rest", "i8"),
-    ("free", "f8", 6),
+    ("unloaded", "f8", 6),
     ("periods", "i8", PERIOD_BINS),
   ],
-  # From the control process, once it has opened them: see ``Device.describe``.
+  # From the control process, once they are connected: see ``Device.describe``.
   "devices": [("arm", DESCRIPTION), ("gripper", DESCRIPTION)],
   # From the policy process; "order" is that of the episode, "ended" that of the last
   # one that has ended and is in the log, "index" its number there or -1.

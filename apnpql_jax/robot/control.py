@@ -97,7 +97,7 @@ class Control:
     if stopped:
       self._hand.hold(now)
     ended = stopped and (command.at_rest or state.fault)
-    if ended or (home and self._is_home(command)):
+    if ended or (home and self._ends_home(command, state)):
       self._rest()
     else:
       self._arm.send_action(command.position)
@@ -122,15 +122,25 @@ class Control:
         core.supervisor.stop(f"gripper: still at {angle:.2f} rad after {GRIP_S:g} s")
     return command
 
-  def _is_home(self, command: Command) -> bool:
-    """Returns whether arm, gripper and force sensor are as an episode begins."""
-    arrived = command.mode is Mode.FOLLOW and self._core.has_arrived(self._target)
-    if not (arrived and self._hand.is_at(self._closed)):
+  def _ends_home(self, command: Command, state: ArmState) -> bool:
+    """Checks the force sensor of a robot at home; returns whether an episode may begin.
+
+    Only readings of a robot at rest count. A sensor that is wrong stops the motion.
+    """
+    if not self._is_home(command, state):
       self._zero.forget()
       return False
-    refusal = self._zero.check() if self._zero.is_sure else ""
+    if not self._zero.is_sure:
+      return False
+    refusal = self._zero.check()
     self._core.supervisor.stop(refusal)
-    return self._zero.is_sure and not refusal
+    return not refusal
+
+  def _is_home(self, command: Command, state: ArmState) -> bool:
+    """Returns whether arm and gripper rest as an episode begins."""
+    arrived = command.mode is Mode.FOLLOW and self._core.has_arrived(self._target)
+    still = np.abs(state.velocity).max() < REST_RAD_S
+    return bool(arrived and still and self._hand.is_at(self._closed))
 
   def _action(self) -> Action | None:
     """Returns the policy's newest action of this episode, if there is one."""
@@ -197,7 +207,7 @@ class Control:
         "reason": self._told[1],
         "done": self._done,
         "at_rest": self.at_rest,
-        "free": self._zero.free,
+        "unloaded": self._zero.unloaded,
         "periods": self._periods,
       }
     )

@@ -28,15 +28,15 @@ class Options:
 
 
 @dataclasses.dataclass(frozen=True)
-class Home:
-  """What came of a way home."""
+class Homing:
+  """What came of a motion to the neutral pose."""
 
-  free: list[float] | None = None
-  """What the free hand read there, f64[6] in N and N m, with the zero of the motion
-  before; None if the robot did not get there."""
+  unloaded_wrench: list[float] | None = None
+  """What the hand read there, where nothing should touch it, f64[6] in N and N m, with
+  the zero of the motion before; None if the robot did not get there."""
 
-  put_back: str | None = None
-  """Why a simulated robot did not get there and was put back where it began."""
+  reset_reason: str | None = None
+  """Why a simulated robot did not get there and was reset."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,11 +67,11 @@ class Outcome:
   dataset_index: int | None = None
   """Index of the episode in the dataset of the log, if it is there."""
 
-  before: Home = Home()
-  """The way home before the episode, after which the sensor was zeroed."""
+  homing_before: Homing = Homing()
+  """Of the homing before the episode, after which the sensor was zeroed."""
 
-  after: Home | None = None
-  """The way home after the episode; None if there was none."""
+  homing_after: Homing | None = None
+  """Of the homing after the episode; None if there was none."""
 
   @property
   def stopped(self) -> bool:

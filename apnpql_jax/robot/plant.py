@@ -143,7 +143,7 @@ class Plant:
 
 
 def subtree(model: mujoco.MjModel, root: int) -> np.ndarray:
-  """Returns bool[bodies]: whether a body is ``root`` or hangs on it."""
+  """Returns bool[bodies]: whether a body is ``root`` or its descendant."""
   inside = np.zeros(model.nbody, bool)
   for body in range(root, model.nbody):
     inside[body] = body == root or inside[model.body_parentid[body]]

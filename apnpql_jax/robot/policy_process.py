@@ -145,9 +145,9 @@ def main(robot: Robot, board_name: str, options: dict[str, Any], peer: Pipe) -> 
 
 
 def _described(robot: Robot, board: Board, cameras: Sequence[Camera]) -> dict[str, Any]:
-  """Returns what all devices say of themselves, once arm and gripper are open.
+  """Returns what all devices say of themselves, once arm and gripper are connected.
 
-  If these cannot be opened, this process ends with the control process.
+  If they cannot be, this process ends with the control process.
   """
   comes_true(lambda: bool(text(board["devices"].read()["arm"])), math.inf)
   found = board["devices"].read()

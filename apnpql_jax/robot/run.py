@@ -26,7 +26,7 @@ from apnpql_jax.errors import (
 )
 from apnpql_jax.robot import replay
 from apnpql_jax.robot.devices import Robot
-from apnpql_jax.robot.episodes import Home, Options, Outcome
+from apnpql_jax.robot.episodes import Homing, Options, Outcome
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.session import Session
 from apnpql_jax.robot.supervisor import NO_ACTION
@@ -80,7 +80,7 @@ def _play(
   outcomes: list[Outcome],
   episodes: int,
 ) -> str:
-  """Adds an outcome for each episode; returns what has ended them before their number.
+  """Adds an outcome for each episode; returns what has ended the session early.
 
   The arm has moved by then, so that no failure is one of bad input any more.
   """
@@ -97,7 +97,7 @@ def _play(
       try:
         _go_home(session)
       finally:
-        outcomes[-1] = dataclasses.replace(outcomes[-1], after=session.home)
+        outcomes[-1] = dataclasses.replace(outcomes[-1], homing_after=session.homing)
         _keep(options.log, outcomes)
   except (UserError, OSError) as error:
     return one_line(error)
@@ -105,9 +105,11 @@ def _play(
 
 
 def _go_home(session: Session) -> None:
-  session.go_home()
-  if reason := session.home.put_back:
-    print_line(f"the simulated robot was put back where it began: {reason}")
+  try:
+    session.go_home()
+  finally:
+    if reason := session.homing.reset_reason:
+      print_line(f"the simulated robot was reset: {reason}")
 
 
 @contextlib.contextmanager
@@ -190,7 +192,7 @@ def _summary(
       "success_rate": solved / len(judged),
       "ci95": wilson_interval(solved, len(judged)),
     }
-  found |= _at_home([x.after for x in outcomes if x.after is not None])
+  found |= _at_home([x.homing_after for x in outcomes if x.homing_after is not None])
   if options.log is not None and outcomes:
     found["log"] = options.log
   if failure:
@@ -198,16 +200,16 @@ def _summary(
   return found
 
 
-def _at_home(ways: Sequence[Home]) -> dict[str, Any]:
-  """Returns what the ways home after episodes have shown.
+def _at_home(ways: Sequence[Homing]) -> dict[str, Any]:
+  """Returns what the homings after episodes have shown.
 
-  ``zero_error_n`` and ``zero_error_nm`` are the largest force and torque of a free hand
-  there, ``put_back`` how often a simulated robot was put back.
+  ``zero_error_n`` and ``zero_error_nm`` are the largest force and torque that the hand
+  read there, ``resets`` how often a simulated robot was reset.
   """
   found: dict[str, Any] = {}
-  if free := [x.free for x in ways if x.free is not None]:
-    norms = np.linalg.norm(np.reshape(free, (-1, 2, 3)), axis=2).max(0)
+  if read := [x.unloaded_wrench for x in ways if x.unloaded_wrench is not None]:
+    norms = np.linalg.norm(np.reshape(read, (-1, 2, 3)), axis=2).max(0)
     found["zero_error_n"], found["zero_error_nm"] = norms.tolist()
-  if put_back := sum(x.put_back is not None for x in ways):
-    found["put_back"] = put_back
+  if resets := sum(x.reset_reason is not None for x in ways):
+    found["resets"] = resets
   return found

@@ -15,7 +15,7 @@ from apnpql_jax.errors import INTERRUPTED, DeviceError, RunStopped
 from apnpql_jax.robot import policy_process, simulated
 from apnpql_jax.robot.board import PERIOD_BIN_S, Board, Phase, text
 from apnpql_jax.robot.devices import Robot
-from apnpql_jax.robot.episodes import SOLVED, TIME_LIMIT, Home, Options, Outcome
+from apnpql_jax.robot.episodes import SOLVED, TIME_LIMIT, Homing, Options, Outcome
 from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.orders import Orders, comes_true
 from apnpql_jax.robot.policy_folder import PolicyFolder
@@ -26,7 +26,7 @@ START_S = 600.0
 """Time that the processes may take to start; programs compile on first use."""
 
 HOME_S = 60.0
-"""Time of the session that the way to the neutral pose may take, or a person's help."""
+"""Longest time of a motion to the neutral pose, or of an operator's help, s."""
 
 UNKNOWN = "the arm's controller holds; its state is unknown"
 
@@ -56,8 +56,8 @@ class Session(contextlib.AbstractContextManager):
     self._stack = contextlib.ExitStack()
     self.board = self._stack.enter_context(Board())
     self._orders = Orders(self.board)
-    self._person: simulated.Person | None = None
-    self.home = Home()
+    self._operator: simulated.Operator | None = None
+    self.homing = Homing()
     """What came of the last ``go_home``."""
     self.processes: Processes | None = None
     """The control and the policy process."""
@@ -90,21 +90,21 @@ class Session(contextlib.AbstractContextManager):
     """Moves the arm to the neutral pose of the policy, and the gripper as it begins.
 
     There, the force sensor must read what a free hand may. A simulated robot that does
-    not get there is put back where it began, as by a person, and tries again. ``home``
-    is what came of it, also after an error.
+    not get there is reset, as an operator would free it, and tries again. ``homing`` is
+    what came of it, also after an error.
 
     Raises:
       DeviceError: It cannot get there, or a process has ended.
     """
-    self.home = Home()
+    self.homing = Homing()
     reason = self._try_to_go_home()
-    if reason and self._person is not None:
-      self.home = Home(put_back=reason)
-      self._person.free_arm()
-      self._person.place_objects()
+    if reason and self._operator is not None:
+      self.homing = Homing(reset_reason=reason)
+      self._operator.free_arm()
+      self._operator.place_objects()
       reason = self._try_to_go_home()
     if reason:
-      raise DeviceError(f"no episode can begin: {reason}")
+      raise DeviceError(f"the arm is not home: {reason}")
 
   def play(self, watch: Callable[[Any], None] | None = None) -> Outcome:
     """Plays an episode from the neutral pose; ``watch`` gets the records "policy".
@@ -115,8 +115,8 @@ class Session(contextlib.AbstractContextManager):
     Raises:
       DeviceError: A process has ended before the episode.
     """
-    if self._person is not None:
-      self._person.place_objects()
+    if self._operator is not None:
+      self._operator.place_objects()
     self._take_events()
     self._events.clear()
     begin, overruns = self._clock.now(), self._overruns()
@@ -136,7 +136,7 @@ class Session(contextlib.AbstractContextManager):
       missed_periods=int(policy["missed"]),
       overruns=self._overruns() - overruns,
       dataset_index=int(policy["index"]) if policy["index"] >= 0 else None,
-      before=self.home,
+      homing_before=self.homing,
     )
 
   def check(self) -> None:
@@ -149,8 +149,8 @@ class Session(contextlib.AbstractContextManager):
     self._take_events()
     self._check_signals()
     failure = self._failure or text(self.board["policy"].read()["error"])
-    if not failure and self._person is not None:
-      failure = self._person.error
+    if not failure and self._operator is not None:
+      failure = self._operator.error
     ended = self._running.ended
     if failure or ended:
       # The control process first brings the arm to rest.
@@ -183,7 +183,7 @@ class Session(contextlib.AbstractContextManager):
       robot = self._stack.enter_context(started)
       plant = self._stack.enter_context(simulated.opened(robot))
       wait = functools.partial(self._wait, seconds=HOME_S * self._clock.slowdown)
-      self._person = simulated.Person(plant, wait)
+      self._operator = simulated.Operator(plant, wait)
     self.processes = Processes(
       robot,
       self.board.name,
@@ -209,8 +209,9 @@ class Session(contextlib.AbstractContextManager):
     wait = HOME_S * self._clock.slowdown
     self._wait(lambda: self._orders.done, "the arm to go home", wait)
     state = self.board["state"].read()
-    if np.isfinite(state["free"]).all():
-      self.home = dataclasses.replace(self.home, free=state["free"].tolist())
+    if np.isfinite(state["unloaded"]).all():
+      wrench = state["unloaded"].tolist()
+      self.homing = dataclasses.replace(self.homing, unloaded_wrench=wrench)
     return text(state["reason"]) if state["mode"] == Mode.STOP else ""
 
   def _is_ready(self) -> bool:

@@ -161,8 +161,8 @@ def opened(robot: Robot) -> Generator[Board]:
     yield board
 
 
-class Person:
-  """What a person does at a real arm, done to a started plant."""
+class Operator:
+  """What an operator does at a real arm, done to a started plant."""
 
   def __init__(self, board: Board, wait: Callable[[Callable[[], bool], str], None]):
     """Keeps the plant's board; ``wait`` waits for a condition, which has a name."""

@@ -75,7 +75,7 @@ class Scene:
     return variant
 
   def park(self, plant: Plant) -> None:
-    """Puts the arm near the neutral pose, as a person would free it."""
+    """Puts the arm near the neutral pose, as an operator would free it."""
     scene = self._task.scene
     plant.put_arm(scene.keyframe("neutral")[scene.arm_qpos] + PARKED)
 

@@ -36,8 +36,8 @@ class Zero:
     """Begins with a sensor whose offset is not known."""
     self._readings: deque[np.ndarray] = deque(maxlen=_READINGS)
     self._known = False
-    self.free = np.full(6, np.nan)
-    """What the hand read at home, where it is free, f64[6], N and N m; NaN before."""
+    self.unloaded = np.full(6, np.nan)
+    """What the hand read at home, f64[6], N and N m; NaN before."""
 
   def note(self, wrench: np.ndarray) -> None:
     """Takes the reading of a cycle, f64[6] in N and N m."""
@@ -46,7 +46,7 @@ class Zero:
   def forget(self) -> None:
     """Drops all readings, as those of a moving arm."""
     self._readings.clear()
-    self.free = np.full(6, np.nan)
+    self.unloaded = np.full(6, np.nan)
 
   @property
   def is_sure(self) -> bool:
@@ -55,7 +55,7 @@ class Zero:
 
   def check(self) -> str:
     """Keeps what the hand reads at home; returns why it cannot be right and free."""
-    self.free = np.mean(self._readings, axis=0)
+    self.unloaded = np.mean(self._readings, axis=0)
     return self._refusal()
 
   def start(self, arm: Arm, *, again: bool) -> str:
@@ -82,7 +82,7 @@ class Zero:
       return ""
     force, torque = np.linalg.norm(mean.reshape(2, 3), axis=1)
     return (
-      f"the arm reads {force:.0f} N and {torque:.1f} N m at rest before zeroing: free "
-      "the hand; if it is free, start again, as the sensor has drifted, or check the "
-      "payload in robot.toml"
+      f"the arm reads {force:.0f} N and {torque:.1f} N m at rest: free the hand; if it "
+      "is free, start again, as the sensor has drifted, or check the payload in "
+      "robot.toml"
     )

@@ -63,11 +63,11 @@ def diagnose(
 ) -> dict[str, Any]:
   """Plays held-out episodes with a checkpoint of a run and reports what limits them.
 
-  The arguments and errors are those of ``evaluate``. ``acting`` plays the episodes that
-  all figures but ``solved`` are about.
+  The arguments and errors are those of ``evaluate``. All figures but
+  ``solved`` are of episodes that ``acting`` plays.
 
   Returns:
-    acting: That rule.
+    acting: The rule that was played.
     solved: Episodes solved by each acting rule, see ``agents/acting.py``.
     failures: Failed episodes by their last stage. "object after goal" is an object that
       was lost.

@@ -1,4 +1,4 @@
-"""The policy that is kept in the repository: it fits the present scene, and solves it."""
+"""The policy kept in the repository fits the present scene and solves it."""
 
 from __future__ import annotations
 
@@ -28,10 +28,11 @@ def test_the_kept_policy_was_trained_with_the_preset_for_the_present_arm():
   assert contract["task"] == preset.env.task
   assert contract["randomization"] == dataclasses.asdict(preset.env.randomization)
   assert contract["origin"]["checkpoint_step"] == preset.total_steps
+  assert contract["acting"]["rule"] == preset.eval_acting
 
 
 def test_the_kept_policy_puts_plates_into_boxes():
-  """In the world of the scene file; in randomized ones it fails at one plate of 17."""
+  """In the world of the scene file; its README has what it solves in others."""
   program = export.deserialize(bytearray((FOLDER / "policy.bin").read_bytes()))
   call = jax.jit(program.call)
 

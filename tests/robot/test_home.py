@@ -23,12 +23,12 @@ from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot.board import Board
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.devices import Robot
-from apnpql_jax.robot.episodes import Home, Options
+from apnpql_jax.robot.episodes import Homing, Options
 from apnpql_jax.robot.hand import THERE_RAD
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.sensor import load
 from apnpql_jax.robot.session import Session
-from apnpql_jax.robot.simulated import Person
+from apnpql_jax.robot.simulated import Operator
 from apnpql_jax.robot.simulation import RECORDS
 from apnpql_jax.sim import motors
 
@@ -44,7 +44,7 @@ POLICY = PolicyFolder(Path("policy"), CONTRACT)
 
 
 class Rig(rigs.Rig):
-  """A rig that may have a box between its fingers, until a person takes it out."""
+  """A rig that may have a box between its fingers, until an operator takes it out."""
 
   jammed = False
 
@@ -55,7 +55,7 @@ class Rig(rigs.Rig):
 
   @property
   def objects_placed(self) -> int:
-    """How often a person has placed the objects."""
+    """How often an operator has placed the objects."""
     return int(self._plant_board["scene"].read()["number"])
 
   def open_fingers(self) -> None:
@@ -72,7 +72,7 @@ class Rig(rigs.Rig):
 
 
 @contextlib.contextmanager
-def playing(*, person: bool) -> Generator[tuple[Session, Rig]]:
+def playing(*, operator: bool) -> Generator[tuple[Session, Rig]]:
   """Yields a session between two episodes, and its rig, whose clock runs.
 
   Its fingers are open and begin an episode closed.
@@ -84,9 +84,9 @@ def playing(*, person: bool) -> Generator[tuple[Session, Rig]]:
     board = stack.enter_context(Board(records=RECORDS))
     rig = Rig(session.board, board, task_name="stack_box")
     rig.open_fingers()
-    if person:
+    if operator:
       wait = functools.partial(session._wait, seconds=60.0)
-      session._person = Person(board, wait)
+      session._operator = Operator(board, wait)
 
     def turn() -> None:
       while not over.is_set():
@@ -103,50 +103,55 @@ def playing(*, person: bool) -> Generator[tuple[Session, Rig]]:
       session.close()
 
 
-@pytest.mark.parametrize("person", [True, False])
-def test_a_robot_that_gets_home_needs_no_help(person):
-  with playing(person=person) as (session, rig):
+@pytest.mark.parametrize("operator", [True, False])
+def test_a_robot_that_gets_home_needs_no_help(operator):
+  with playing(operator=operator) as (session, rig):
     session.go_home()
-    free = session.home.free
-    assert free is not None and load(np.array(free)) <= 1
-    assert session.home == Home(free=free)
+    read = session.homing.unloaded_wrench
+    assert read is not None and load(np.array(read)) <= 1
+    assert session.homing == Homing(unloaded_wrench=read)
     assert rig.objects_placed == 0
 
 
 def test_a_jammed_gripper_of_a_simulated_robot_is_freed():
-  with playing(person=True) as (session, rig):
+  with playing(operator=True) as (session, rig):
     rig.jammed = True
     session.go_home()
-    assert session.home.put_back is not None
-    assert JAM.fullmatch(session.home.put_back)
-    assert session.home.free is not None
+    assert session.homing.reset_reason is not None
+    assert JAM.fullmatch(session.homing.reset_reason)
+    assert session.homing.unloaded_wrench is not None
     assert abs(rig.finger - 1.1) < THERE_RAD
     assert rig.objects_placed == 1
     session.go_home()
-    assert session.home.put_back is None
+    assert session.homing.reset_reason is None
 
 
 def test_a_gripper_that_does_not_move_again_ends_the_session(monkeypatch):
   monkeypatch.setattr(motors, "gripper_torque", lambda *_, **__: 0.0)  # No power.
-  with playing(person=True) as (session, rig):
-    with pytest.raises(DeviceError, match=f"no episode can begin: {JAM.pattern}"):
+  with playing(operator=True) as (session, rig):
+    with pytest.raises(DeviceError, match=f"the arm is not home: {JAM.pattern}"):
       session.go_home()
-    assert session.home.put_back is not None and session.home.free is None
+    assert (
+      session.homing.reset_reason is not None and session.homing.unloaded_wrench is None
+    )
     assert rig.objects_placed == 1
 
 
 def test_nobody_frees_a_real_gripper():
-  with playing(person=False) as (session, rig):
+  with playing(operator=False) as (session, rig):
     rig.jammed = True
-    with pytest.raises(DeviceError, match=f"no episode can begin: {JAM.pattern}"):
+    with pytest.raises(DeviceError, match=f"the arm is not home: {JAM.pattern}"):
       session.go_home()
-    assert session.home == Home()
+    assert session.homing == Homing()
 
 
 def test_a_sensor_that_has_drifted_ends_the_session_and_is_recorded():
-  with playing(person=True) as (session, rig):
+  with playing(operator=True) as (session, rig):
     session.go_home()
     rig.plant.sensor.drift(np.array([0, 0, 20.0, 0, 0, 0]))
-    with pytest.raises(DeviceError, match="no episode can begin: the arm reads"):
+    with pytest.raises(DeviceError, match="the arm is not home: the arm reads"):
       session.go_home()
-    assert session.home.free is not None and session.home.free[2] > 12
+    assert (
+      session.homing.unloaded_wrench is not None
+      and session.homing.unloaded_wrench[2] > 12
+    )

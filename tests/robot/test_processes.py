@@ -211,7 +211,7 @@ def _alive(pid: int) -> bool:
   return state != "Z" and os.path.exists(f"/proc/{pid}")
 
 
-def test_a_simulated_arm_can_be_put_back_where_it_began():
+def test_a_simulated_arm_can_be_reset():
   robot = Robot("simulated", CONTRACT, Cell(), CLOCK)
   with simulated.started(robot) as robot, simulated.opened(robot) as plant:
     begin = plant["plant"].read()["position"]

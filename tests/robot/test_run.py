@@ -98,8 +98,8 @@ def test_an_untrained_policy_plays_its_episodes_in_order(folder):
   assert [x["dataset_index"] for x in kept] == [0, 1]
   for episode in kept:
     check_events(episode)
-    assert load(np.array(episode["after"]["free"])) <= 1
-  assert kept[1]["before"] == kept[0]["after"]
+    assert load(np.array(episode["homing_after"]["unloaded_wrench"])) <= 1
+  assert kept[1]["homing_before"] == kept[0]["homing_after"]
   assert 0 < found["zero_error_n"] <= FREE_FORCE
   log = lerobot.read(folder / "log")
   assert log.about["devices"]["robot"] == "simulated"

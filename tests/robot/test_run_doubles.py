@@ -139,14 +139,16 @@ def test_a_sensor_that_drifts_in_an_episode_ends_the_session_after_it(folder):  
       ask(host, "drift_force")
     found, errors = finish(process)
     assert found["exit_code"] == 3 and found["failure"], errors
-    if moving and "before zeroing: free the hand" in found["failure"]:
+    if moving and "at rest: free the hand" in found["failure"]:
       break
     assert not moving or not is_in_time(found), found
   else:
     pytest.skip(f"the machine is too busy: {errors}")
-  after = episodes(log)[-1]["after"]
-  np.testing.assert_allclose(after["free"], DRIFT, atol=1.0)
-  assert found["zero_error_n"] == pytest.approx(np.linalg.norm(after["free"][:3]))
+  after = episodes(log)[-1]["homing_after"]
+  np.testing.assert_allclose(after["unloaded_wrench"], DRIFT, atol=1.0)
+  assert found["zero_error_n"] == pytest.approx(
+    np.linalg.norm(after["unloaded_wrench"][:3])
+  )
 
 
 def wait_for_an_action(host: str, process: subprocess.Popen[str]) -> bool:

@@ -17,7 +17,7 @@ from apnpql_jax.errors import DeviceError, FileError, RunStopped
 from apnpql_jax.robot import run
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.devices import Robot
-from apnpql_jax.robot.episodes import Home, Options, Outcome
+from apnpql_jax.robot.episodes import Homing, Options, Outcome
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.recorder import Recorder
 
@@ -81,8 +81,8 @@ class Drifting(contextlib.nullcontext):
   def __init__(self, robot: Robot, policy: Any, options: Options, signals: Any):
     super().__init__()
     del robot, policy, options, signals
-    self.home = Home()
-    self._ways = iter([Home(FREE), Home(FREE, "gripper: still"), Home(PRESSED)])
+    self.homing = Homing()
+    self._ways = iter([Homing(FREE), Homing(FREE, "gripper: still"), Homing(PRESSED)])
 
   def __enter__(self) -> Drifting:
     return self
@@ -92,12 +92,12 @@ class Drifting(contextlib.nullcontext):
   def check(self) -> None: ...
 
   def go_home(self) -> None:
-    self.home = next(self._ways)
-    if self.home.free == PRESSED:
-      raise DeviceError("no episode can begin: the arm reads 14 N")
+    self.homing = next(self._ways)
+    if self.homing.unloaded_wrench == PRESSED:
+      raise DeviceError("the arm is not home: the arm reads 14 N")
 
   def play(self) -> Outcome:
-    return Outcome(None, "time limit", 5, 1.0, [], before=self.home)
+    return Outcome(None, "time limit", 5, 1.0, [], homing_before=self.homing)
 
 
 def test_each_line_has_what_both_ways_home_have_shown(tmp_path, monkeypatch, capsys):
@@ -105,20 +105,21 @@ def test_each_line_has_what_both_ways_home_have_shown(tmp_path, monkeypatch, cap
   found = play(tmp_path / "log", episodes=4)
   lines = (tmp_path / "log" / run.EVENTS).read_text().splitlines()
   first, second = (json.loads(line) for line in lines)
-  freed = {"free": FREE, "put_back": "gripper: still"}
-  assert (first["before"], first["after"]) == ({"free": FREE, "put_back": None}, freed)
-  assert second["before"] == freed
-  assert second["after"] == {"free": PRESSED, "put_back": None}
+  free = {"unloaded_wrench": FREE, "reset_reason": None}
+  freed = {"unloaded_wrench": FREE, "reset_reason": "gripper: still"}
+  assert (first["homing_before"], first["homing_after"]) == (free, freed)
+  assert second["homing_before"] == freed
+  assert second["homing_after"] == free | {"unloaded_wrench": PRESSED}
   assert (found["zero_error_n"], found["zero_error_nm"]) == (14.0, 0.2)
-  assert (found["put_back"], found["exit_code"], found["episodes"]) == (1, 3, 2)
+  assert (found["resets"], found["exit_code"], found["episodes"]) == (1, 3, 2)
   shown = capsys.readouterr().err
-  assert "the simulated robot was put back where it began: gripper: still" in shown
-  assert "ends after 2 of 4 episodes: no episode can begin: the arm reads 14 N" in shown
+  assert "the simulated robot was reset: gripper: still" in shown
+  assert "ends after 2 of 4 episodes: the arm is not home: the arm reads 14 N" in shown
 
 
 def test_the_arm_goes_home_after_the_last_episode(tmp_path, monkeypatch):
   monkeypatch.setattr(run, "Session", Drifting)
   found = play(tmp_path / "log", episodes=1)
   (line,) = (tmp_path / "log" / run.EVENTS).read_text().splitlines()
-  assert json.loads(line)["after"]["free"] == FREE
+  assert json.loads(line)["homing_after"]["unloaded_wrench"] == FREE
   assert "failure" not in found and found["episodes"] == 1

@@ -54,9 +54,7 @@ def rig(request) -> Generator[Rig]:
 
 def is_refused(state) -> bool:
   reason = state["reason"].decode()
-  return (
-    state["mode"] == Mode.STOP and "at rest before zeroing: free the hand" in reason
-  )
+  return state["mode"] == Mode.STOP and "at rest: free the hand" in reason
 
 
 def test_a_plant_takes_what_presses_on_it_for_nothing(rig):
@@ -130,11 +128,11 @@ def test_each_way_home_shows_the_error_of_the_zero(rig):
     error = offset(rig)
     rig.order(Phase.HOME)
     if drift:
-      np.testing.assert_allclose(rig.state["free"], error, atol=0.35)
-    assert np.isfinite(rig.state["free"]).all() and rig.state["mode"] == Mode.FOLLOW
+      np.testing.assert_allclose(rig.state["unloaded"], error, atol=0.35)
+    assert np.isfinite(rig.state["unloaded"]).all() and rig.state["mode"] == Mode.FOLLOW
     assert rig.order(Phase.PLAY, seconds=0.1)["mode"] == Mode.HOLD
     assert np.linalg.norm(offset(rig) - error) > 0.5  # A new error, drawn at the zero.
-    assert np.isnan(rig.state["free"]).all()
+    assert np.isnan(rig.state["unloaded"]).all()
     rig.order(Phase.IDLE)
 
 
@@ -147,6 +145,6 @@ def test_a_zero_that_becomes_wrong_in_an_episode_is_found_after_it(rig):
   assert rig.state["mode"] == Mode.HOLD and rig.reason.startswith("policy: ")
   rig.order(Phase.IDLE)
   assert is_refused(rig.order(Phase.HOME))
-  np.testing.assert_allclose(rig.state["free"], error, atol=0.35)
+  np.testing.assert_allclose(rig.state["unloaded"], error, atol=0.35)
   assert rig.arm.zeros == zeros
   assert is_refused(rig.order(Phase.PLAY))

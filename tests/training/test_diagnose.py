@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from typing import Any
 
 import jax
@@ -116,3 +117,13 @@ def test_the_command_reports_a_run(tmp_path, capsys):
   shown = capsys.readouterr().out
   for words in ("solved", "stages object", "calibration return", "kl_over_epsilon"):
     assert words in shown
+  # Another rule plays other episodes, and so do other reset states.
+  found = []
+  for options in ([], ["--acting", "prior"], ["--bank-seed", "1"]):
+    assert main.main(["diagnose", run, "--episodes", "6", "--json", *options]) == 0
+    found.append(json.loads(capsys.readouterr().out))
+  assert [x["acting"] for x in found] == ["policy", "prior", "policy"]
+  assert (
+    found[0]["alpha"] != found[1]["alpha"] and found[0]["alpha"] != found[2]["alpha"]
+  )
+  assert main.main(["diagnose", run, "--acting", "best"]) == 2
