@@ -83,7 +83,7 @@ def parametric(
   actions, outputs, q_values = score(heads.frozen(), samples)
   log_prob = policy.log_prob(samples).reshape(2, *arm.shape[:-1])
   component = jnp.moveaxis(jnp.asarray(policy.choice.probs), -1, 0)
-  weights = component * jax.nn.softmax(log_prob, axis=0) / draws
+  weights = component[None, None] * jax.nn.softmax(log_prob, axis=0) / draws
   weights = weights.reshape(q_values.shape)
   tilt = jnp.zeros(q_values.shape[1:])
   return Candidates(samples, actions, outputs, q_values, weights, policy, tilt)
