@@ -106,14 +106,19 @@ class Encoder(nn.Module):
       state.append(seen_from(tool, objects))
     # Encode the images: keypoints join the state, maps are projected.
     maps, channels = [], (config.patch_channels, config.conv_channels)
-    layers = (channels, config.conv_overlap, config.residual_blocks)
-    layers += (config.standardize_images,)
+    camera = functools.partial(
+      PixelEncoder,
+      channels,
+      config.conv_overlap,
+      config.residual_blocks,
+      standardize=config.standardize_images,
+    )
     for name, image, kind in (
       ("global_image", observation.global_image, config.global_features),
       ("wrist_image", observation.wrist_image, config.wrist_features),
     ):
       if image is not None:
-        pixels, points = PixelEncoder(*layers, name=name)(image)
+        pixels, points = camera(name=name)(image)
         if kind != "map":
           state.append(points)
         if kind != "keypoints":

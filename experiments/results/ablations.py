@@ -8,9 +8,6 @@ See ``comparison``. A row changes one part of the preset of the task.
 
 from __future__ import annotations
 
-import dataclasses
-from pathlib import Path
-
 from comparison import Row
 import pixel_comparison
 
@@ -31,16 +28,11 @@ ROWS = {
   "true_primitives": Row("ap_npql", "--env.true-primitives"),
 }
 
-
-COMPARISON = dataclasses.replace(
-  pixel_comparison.COMPARISON,
-  out=Path(__file__).resolve().with_suffix(""),
-  sweep=Path("runs/ablations"),
-  rows=ROWS,
-  options=lambda task, row, seed: pixel_comparison.options(task, ROWS[row], seed),
+COMPARISON = pixel_comparison.variant(
+  __file__,
+  ROWS,
   more=("prior",),
   tasks=("push_plate", "flip_cup"),
-  wanted=tuple(ROWS),
   seeds=(0, 1),
 )
 

@@ -12,7 +12,9 @@ updates and candidates. Settings of the rows are those that a search from states
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
+from typing import Any
 
 from comparison import PAPER, Comparison, Row
 import state_comparison
@@ -53,6 +55,21 @@ COMPARISON = Comparison(
   second="by means",
   axes=("steps", "minutes"),
 )
+
+
+def variant(script: str, rows: dict[str, Row], **changes: Any) -> Comparison:
+  """Returns this comparison with other rows, and its results next to a script."""
+  out = Path(script).resolve().with_suffix("")
+  return dataclasses.replace(
+    COMPARISON,
+    out=out,
+    sweep=Path("runs") / out.name,
+    rows=rows,
+    options=lambda task, row, seed: options(task, rows[row], seed),
+    wanted=tuple(rows),
+    **changes,
+  )
+
 
 if __name__ == "__main__":
   COMPARISON.main(__doc__)

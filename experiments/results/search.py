@@ -12,9 +12,6 @@ from reset states that neither training nor ``pixel_comparison`` uses.
 
 from __future__ import annotations
 
-import dataclasses
-from pathlib import Path
-
 from comparison import PAPER, Row
 import numpy as np
 import pixel_comparison
@@ -50,15 +47,11 @@ def trials(row: str) -> dict[str, Row]:
 
 ROWS = {name: trial for row in PAPER for name, trial in trials(row).items()}
 
-COMPARISON = dataclasses.replace(
-  pixel_comparison.COMPARISON,
-  out=Path(__file__).resolve().with_suffix(""),
-  sweep=Path("runs/search"),
-  rows=ROWS,
-  options=lambda task, row, seed: pixel_comparison.options(task, ROWS[row], seed),
+COMPARISON = pixel_comparison.variant(
+  __file__,
+  ROWS,
   play="--episodes 512 --bank-seed 2",
   tasks=("push_plate",),
-  wanted=tuple(ROWS),
   seeds=(0,),
 )
 

@@ -117,7 +117,7 @@ def test_the_way_home_keeps_the_zero_of_the_episode(rig):
 
 
 def offset(rig: Rig) -> np.ndarray:
-  """Returns what the sensor reads without a force, but for its noise."""
+  """Returns the reading of an unloaded sensor, without its noise."""
   return np.mean([rig.plant.sensor.read(np.zeros(6)) for _ in range(5000)], axis=0)
 
 
@@ -141,7 +141,7 @@ def test_a_zero_that_becomes_wrong_in_an_episode_is_found_after_it(rig):
   rig.order(Phase.PLAY, seconds=0.1)
   rig.plant.sensor.drift(np.array([0, 0, 15.0, 0, 0, 0]))
   error, zeros = offset(rig), rig.arm.zeros
-  rig.idle(0.2)  # It may be a contact, so the episode goes on.
+  rig.idle(0.2)  # A contact would read the same, so the episode continues.
   assert rig.state["mode"] == Mode.HOLD and rig.reason.startswith("policy: ")
   rig.order(Phase.IDLE)
   assert is_refused(rig.order(Phase.HOME))
