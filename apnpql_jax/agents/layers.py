@@ -83,10 +83,9 @@ class Constant(nn.Module):
   """One trained number for all states, in place of an ``MLP`` with one output."""
 
   @nn.compact
-  def __call__(self, x: Float[Array, "*b n"]) -> Float[Array, "*b 1"]:
-    """Returns the number for every state."""
-    value = self.param("value", nn.initializers.zeros, (1,))
-    return jnp.broadcast_to(value, (*x.shape[:-1], 1))
+  def __call__(self, _: Float[Array, "*b n"]) -> Float[Array, " 1"]:
+    """Returns the number."""
+    return self.param("value", nn.initializers.zeros, (1,))
 
 
 class ValueHead(nn.Module):

@@ -273,4 +273,7 @@ def total_loss(
   scale = {"loss/ap": config.lambda_ap}
   total = jnp.sum(jnp.stack([scale.get(k, 1.0) * metrics[k] for k in terms]))
   metrics["q/min"], metrics["q/max"] = jnp.min(q_values), jnp.max(q_values)
+  highest = functools.partial(jnp.quantile, q=0.95)
+  metrics["npql/kl_over_eps_p95"] = highest(per_state["npql/kl_over_eps"])
+  metrics["npql/alpha_p95"] = highest(per_state["npql/alpha_mean"])
   return total, metrics

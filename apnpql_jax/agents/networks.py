@@ -22,6 +22,7 @@ from apnpql_jax.agents.layers import MLP, PRODUCTS, Constant
 from apnpql_jax.agents.mixture_head import (
   mixture_from_outputs,
   mixture_size,
+  one_way_clip,
   spread_means,
 )
 from apnpql_jax.config.schema import AgentConfig
@@ -157,12 +158,17 @@ class Heads:
 
   def alpha(self) -> Float[Array, "*b"]:
     """Returns the temperature > 0 of each state; trains only its own head."""
-    offset = math.log(math.expm1(self.config.initial_alpha))  # Inverse of softplus.
-    if self.config.temperature == "fixed":
-      raw = jnp.zeros(self.phi.shape[:-1])
-    else:
+    initial, lowest = self.config.initial_alpha, self.config.min_alpha
+    raw = jnp.zeros(())
+    if self.config.temperature != "fixed":
       raw = self._apply("alpha", jax.lax.stop_gradient(self.phi))[..., 0]
-    return jax.nn.softplus(raw + offset) + self.config.min_alpha
+    if self.config.alpha_floor == "clip":
+      log_alpha = raw + math.log(initial)
+      alpha = jnp.exp(one_way_clip(log_alpha, math.log(lowest), math.inf))
+    else:
+      offset = math.log(math.expm1(initial))  # Inverse of softplus.
+      alpha = jax.nn.softplus(raw + offset) + lowest
+    return jnp.broadcast_to(alpha, self.phi.shape[:-1])
 
   def z(
     self, actions: Float[Array, " s *b 7"], *, precision: str = "float32"

@@ -29,11 +29,11 @@ MAY_CHANGE = (*REPORTS, *LEARNING)
 
 OF_WEIGHTS = (
   "agent.algorithm agent.policy_evaluation agent.regularizer agent.prior_mean "
-  "agent.temperature agent.diagonal_covariance agent.policy_components agent.hidden "
-  "agent.num_atoms agent.feature_dim agent.patch_channels agent.conv_channels "
-  "agent.conv_overlap agent.residual_blocks agent.lstm_instants "
-  "agent.standardize_images agent.global_features agent.wrist_features env.obs "
-  "env.global_size env.wrist_size"
+  "agent.temperature agent.alpha_floor agent.diagonal_covariance "
+  "agent.policy_components agent.hidden agent.num_atoms agent.feature_dim "
+  "agent.patch_channels agent.conv_channels agent.conv_overlap agent.residual_blocks "
+  "agent.lstm_instants agent.standardize_images agent.global_features "
+  "agent.wrist_features env.obs env.global_size env.wrist_size"
 ).split()
 """Settings that decide which arrays the weights are, or what they read."""
 

@@ -27,6 +27,7 @@ _CHOICES = {
   "eval_acting": ACTING,
   "agent.candidate_precision": ("float32", "bfloat16"),
   "agent.temperature": ("state", "shared", "fixed"),
+  "agent.alpha_floor": ("softplus", "clip"),
   "agent.regularizer": ("row", "uniform"),
   "agent.policy_evaluation": POLICY_EVALUATIONS,
   "agent.prior_mean": ("primitives", "learned"),

@@ -234,11 +234,15 @@ class AgentConfig:
   component weights."""
 
   initial_alpha: float = 0.1
-  """Initial temperature, added to min_alpha, in units of return."""
+  """Initial temperature in units of return; a softplus adds min_alpha."""
 
   min_alpha: float = 1e-3
   """Lower bound of the temperature in units of return; value differences below this are
   treated as noise."""
+
+  alpha_floor: str = codec.added("softplus")
+  """How alpha stays above min_alpha: softplus, which is added to it, or clip. Only with
+  a clip can the limit raise the alpha of a state that has reached the floor."""
 
   initial_value: float = 0.05
   """Expected return before training; low because reward is sparse."""

@@ -90,6 +90,7 @@ def test_no_batch_produces_a_non_finite_number(name: str, pixels: bool, updates:
   assert action.shape == (BATCH, 7) and np.all(np.abs(action) <= 1.0)
   assert set(np.unique(action[:, 6])) <= {0.0, 1.0}
   common = {"q/min", "q/max", "npql/kl_over_eps", "npql/ess", "npql/alpha_mean"}
+  common |= {"npql/kl_over_eps_p95", "npql/alpha_p95"}
   common |= {"prior/entropy", "policy/entropy", "prior/nu", "q/data", "q/target"}
   common |= {f"grad_norm/{group}" for group in state.params}
   assert common <= set(metrics)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from typing import Any
 
@@ -10,10 +11,11 @@ from flax import linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
-from scipy import ndimage, special
+from scipy import ndimage, optimize, special
 
-from apnpql_jax.agents import encoder
+from apnpql_jax.agents import encoder, losses
 from apnpql_jax.agents.columns.policy_evaluation import Categorical
 from apnpql_jax.agents.layers import PositionwiseDense
 from apnpql_jax.agents.mixture_head import mixture_from_outputs, one_way_clip
@@ -364,6 +366,59 @@ def test_a_fixed_temperature_reads_no_parameter():
   config = dataclasses.replace(CONFIG, temperature="fixed", initial_alpha=0.25)
   heads = dataclasses.replace(fresh_heads(config), params={})
   np.testing.assert_allclose(heads.alpha(), 0.25 + config.min_alpha, rtol=1e-6)
+
+
+@pytest.mark.parametrize("epsilon", [0.5, 30.0])
+@pytest.mark.parametrize("start", [-22.0, 3.0])
+def test_a_clipped_alpha_finds_the_minimum_of_its_dual(epsilon: float, start: float):
+  """From either side of the minimum, and where the floor is the minimum."""
+  q = jnp.asarray(np.random.default_rng(0).uniform(size=(64, 8)), jnp.float32)
+  config = dataclasses.replace(CONFIG, temperature="shared", alpha_floor="clip")
+  heads = fresh_heads(config)
+
+  def dual(alpha: jax.Array) -> jax.Array:
+    return jnp.mean(losses.alpha_loss(q, alpha, epsilon=epsilon))
+
+  def loss(raw: jax.Array) -> jax.Array:
+    params = {**heads.params, "alpha": {"value": raw}}
+    return dual(dataclasses.replace(heads, params=params).alpha())
+
+  adam = optax.adam(0.02)
+
+  def step(carry: Any, _: Any) -> Any:
+    raw, state = carry
+    updates, state = adam.update(jax.grad(loss)(raw), state)
+    return (raw + updates, state), None
+
+  raw = jnp.full(1, start)
+  steps = functools.partial(jax.lax.scan, step, length=10_000)
+  (raw, _), _ = jax.jit(steps)((raw, adam.init(raw)))
+  params = {**heads.params, "alpha": {"value": raw}}
+  found = dataclasses.replace(heads, params=params).alpha()[0]
+  exact = optimize.minimize_scalar(
+    lambda x: float(dual(jnp.full(8, x))),
+    bounds=(config.min_alpha, 10.0),
+    method="bounded",
+    options={"xatol": 1e-6},
+  )
+  np.testing.assert_allclose(found, exact.x, rtol=0.02)
+
+
+def test_alpha_leaves_its_floor_only_if_it_is_clipped():
+  for floor, moves in (("softplus", False), ("clip", True)):
+    heads = fresh_heads(dataclasses.replace(CONFIG, alpha_floor=floor))
+    low = {**heads.params["alpha"]}
+    low["out"] = {**low["out"], "bias": jnp.full(1, -22.0)}
+
+    def alpha(head: Any, heads: Heads = heads) -> jax.Array:
+      params = {**heads.params, "alpha": head}
+      return jnp.sum(dataclasses.replace(heads, params=params).alpha())
+
+    up = jax.grad(lambda head: -alpha(head))(low)["out"]["bias"]
+    down = jax.grad(alpha)(low)["out"]["bias"]
+    np.testing.assert_allclose(alpha(low), 8 * CONFIG.min_alpha, rtol=1e-5)
+    assert (np.abs(up[0]) > 1e-4) == moves
+    assert np.abs(down[0]) < 1e-8
 
 
 def test_a_learned_mean_is_trained_and_kept_in_the_box():

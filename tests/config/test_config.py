@@ -37,6 +37,7 @@ ADDED = {
   "env.randomization.shape": 0.0,
   "env.randomization.surroundings": 0.0,
   "agent.candidate_precision": "float32",
+  "agent.alpha_floor": "softplus",
   "agent.primitive_gripper": True,
   "agent.gripper_offset": True,
   "agent.decay_updates": 0,
@@ -307,7 +308,7 @@ def test_a_missing_setting_that_was_added_later_keeps_the_old_behavior():
   old = {k: v for k, v in data["agent"].items() if f"agent.{k}" not in ADDED}
   warnings = []
   assert config_from_json(json.dumps(data | {"agent": old}), warnings.append)
-  assert warnings[0].endswith("agent.color_jitter 0.0, agent.policy_components 1")
+  assert warnings[0].endswith("agent.policy_components 1, agent.alpha_floor softplus")
   assert config_from_json(config_to_json(TrainConfig()), pytest.fail)
 
 
