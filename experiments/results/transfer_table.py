@@ -9,13 +9,15 @@ A cell is physics/renderer/looks and, with Bullet, the latency in ms and "admitt
 `apnpql transfer` plays every cell of every run in a process of its own, and the result
 is stored as <folder>/<run>-<cell>.json. The same command again plays only what is
 missing. It refuses a stored result of another seed, checkpoint or setting. Then it
-writes table.md from all results of the folder. Runs are distinguished by the names of
-their folders.
+writes two tables of all results in the folder: table.md has a row per result, and
+by_training.md a row per cell, with the seeds of each training together. Runs are
+distinguished by the names of their folders, which end with a hyphen and the seed.
 """
 
 from __future__ import annotations
 
 import argparse
+import collections
 import json
 from pathlib import Path
 import subprocess
@@ -27,6 +29,7 @@ from apnpql_jax.cli.commands import task_env
 from apnpql_jax.errors import ConfigError, FileError, UserError, one_line
 from apnpql_jax.reports.tables import listed, markdown
 from apnpql_jax.runs import checkpoint_reader, run_folder
+from apnpql_jax.runs.metrics import wilson_interval
 from apnpql_jax.transfer import conditions
 from apnpql_jax.transfer.cell import Cell
 
@@ -194,6 +197,41 @@ def table(results: list[dict[str, Any]]) -> str:
   return markdown(rows) + "\n"
 
 
+def by_training(results: list[dict[str, Any]]) -> str:
+  """Returns the results of policies in Markdown: a row per cell, a column per training.
+
+  The runs of a training have names that differ after the last hyphen, by their seed.
+  The Wilson interval is that of their episodes together.
+  """
+  of_policies = [found for found in sorted(results, key=order) if "trained" in found]
+  groups = collections.defaultdict[tuple[str, str], list[dict[str, Any]]](list)
+  for found in of_policies:
+    groups[cell_label(found), found["run"].rpartition("-")[0]].append(found)
+  trainings = dict.fromkeys(training for _, training in groups)
+  rows = [["tested in", *trainings]]
+  for cell in dict.fromkeys(map(cell_label, sorted(of_policies, key=cell_order))):
+    rows.append([cell, *(together(groups[cell, training]) for training in trainings)])
+  return markdown(rows) + "\n"
+
+
+def together(found: list[dict[str, Any]]) -> str:
+  """Returns the successes of some results, with the Wilson interval of all episodes."""
+  if not found:
+    return "-"
+  solved, played = (sum(x[name] for x in found) for name in ("successes", "episodes"))
+  low, high = (100 * x for x in wilson_interval(solved, played))
+  each = " + ".join(str(x["successes"]) for x in found)
+  return f"{each} of {played}, {low:.0f} to {high:.0f} %"
+
+
+def cell_label(found: dict[str, Any]) -> str:
+  """Returns the name of a result's cell."""
+  parts = [found[name] for name in ("physics", "renderer", "looks")]
+  if "latency_ms" in found:
+    parts.append(f"{found['latency_ms']} ms")
+  return listed([*parts, *["admittance"] * found.get("admittance", False)])
+
+
 def row_of(found: dict[str, Any]) -> list[str]:
   """Returns the row of a result."""
   low, high = (100 * x for x in found["ci95"])
@@ -214,11 +252,18 @@ def row_of(found: dict[str, Any]) -> list[str]:
 
 def order(found: dict[str, Any]) -> tuple[Any, ...]:
   """Returns what rows are sorted by."""
-  names = [str(found[x]) for x in ("task", "run")]
-  cell = [("mjx", "native", "bullet").index(found["physics"])]
-  cell += [("rays", "opengl", "tiny").index(found["renderer"])]
-  cell += [("plain", "trained", "unseen").index(found["looks"])]
-  return (*names, *cell, found.get("admittance", False), found.get("latency_ms", 0))
+  return str(found["task"]), str(found["run"]), *cell_order(found)
+
+
+def cell_order(found: dict[str, Any]) -> tuple[Any, ...]:
+  """Returns what cells are sorted by."""
+  return (
+    ("mjx", "native", "bullet").index(found["physics"]),
+    ("rays", "opengl", "tiny").index(found["renderer"]),
+    ("plain", "trained", "unseen").index(found["looks"]),
+    found.get("admittance", False),
+    found.get("latency_ms", 0),
+  )
 
 
 def main() -> None:
@@ -250,8 +295,9 @@ def main() -> None:
   except UserError as error:
     sys.exit(str(error))
   if found:
+    (args.out / "by_training.md").write_text(by_training(found))
     (args.out / "table.md").write_text(table(found))
-    print(table(found))
+    print(by_training(found), table(found), sep="\n")
 
 
 def cells_of(run: str) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 import sys
 from typing import Any
@@ -196,10 +197,41 @@ def test_errors_of_the_command_end_the_script(tmp_path, monkeypatch, capsys):
   assert error.value.code == 2 and not list((tmp_path / "out").iterdir())
 
 
+def test_seeds_of_a_training_are_one_sample():
+  base = {
+    "task": "push_plate",
+    "physics": "native",
+    "renderer": "rays",
+    "looks": "plain",
+    "trained": "plain",
+    "episodes": 200,
+  }
+  bullet = {"physics": "bullet", "latency_ms": 60, "admittance": True}
+  results = [
+    base | {"run": "b-0", "successes": 10},
+    base | bullet | {"run": "a-1", "successes": 200},
+    base | {"run": "a-1", "successes": 190},
+    base | {"run": "a-0", "successes": 170},
+    {k: v for k, v in base.items() if k != "trained"} | {"run": "expert"},
+  ]
+  # Wilson's interval of 360 in 400 is that of the normal quantile z.
+  p, n, z = 0.9, 400, 1.96
+  middle = p + z**2 / (2 * n)
+  spread = z * math.sqrt(p * (1 - p) / n + (z / (2 * n)) ** 2)
+  low, high = ((middle + s * spread) / (1 + z**2 / n) for s in (-1, 1))
+  head, _, plain, moved = transfer_table.by_training(results).splitlines()
+  assert head == "| tested in | a | b |"
+  both = f"170 + 190 of 400, {100 * low:.0f} to {100 * high:.0f} %"
+  assert plain == f"| native, rays, plain | {both} | 10 of 200, 3 to 9 % |"
+  assert moved == (
+    "| bullet, rays, plain, 60 ms, admittance | 200 of 200, 98 to 100 % | - |"
+  )
+
+
 @pytest.mark.parametrize("folder", ["", "pilot"])
 def test_the_documents_have_the_stored_results(folder):
-  out = transfer_table.OUT / folder
+  out, document = transfer_table.OUT / folder, testing.ROOT / "docs" / "transfer.md"
   found = [transfer_table.read(path) for path in out.glob("*.json")]
-  table = transfer_table.table(found)
-  assert len(found) > 0 and table in (testing.ROOT / "docs" / "transfer.md").read_text()
-  assert (out / "table.md").read_text() == table
+  table, summary = transfer_table.table(found), transfer_table.by_training(found)
+  assert len(found) > 0 and (out / "table.md").read_text() == table
+  assert (table if folder else summary) in document.read_text()
