@@ -49,6 +49,10 @@ class Transfer(OfRun):
   """trained: worlds that domain randomization draws; plain: no randomization; unseen:
   textures, lights, shadows, clutter and noise that it cannot draw."""
 
+  without: tuple[str, ...] = ()
+  """Parts that unseen looks lack, to find out which one matters: surfaces, lights,
+  shadows, clutter or camera."""
+
   latency_ms: Annotated[int | None, default_hint("(default: 30)")] = None
   """With bullet: time from the virtual arm to the servos: 0, 30 or 60 ms."""
 
@@ -93,7 +97,8 @@ def transfer(args: Transfer) -> dict[str, Any]:
   from apnpql_jax.transfer import transfer as playing  # Imports JAX.
   from apnpql_jax.transfer.cell import Cell
 
-  cell = Cell(args.physics, args.renderer, args.looks, args.latency_ms, args.admittance)
+  names = [field.name for field in dataclasses.fields(Cell)]
+  cell = Cell(**{name: getattr(args, name) for name in names})
   options: dict[str, Any] = {
     "episodes": args.episodes,
     "seed": args.seed,

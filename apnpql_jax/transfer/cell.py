@@ -38,6 +38,9 @@ class Cell:
   """trained: worlds that domain randomization draws, within the ranges of the run,
   physics included; plain: those of the scene file; unseen: see ``looks``."""
 
+  without: tuple[str, ...] = ()
+  """Parts of ``looks.PARTS`` that unseen looks lack."""
+
   latency_ms: int | None = None
   """Time from the virtual arm to the servos, one of ``LATENCIES_MS``; 30 if None.
   Only with Bullet, as the next one."""
@@ -52,6 +55,10 @@ class Cell:
     check_name("--looks", self.looks, LOOKS)
     if self.looks == "unseen" and self.renderer == "rays":
       raise ConfigError("--looks unseen needs --renderer opengl or tiny")
+    for part in self.without:
+      check_name("--without", part, looks.PARTS)
+    if self.without and self.looks != "unseen":
+      raise ConfigError("--without needs --looks unseen")
     if self.physics != "bullet":
       if self.latency_ms is not None or self.admittance:
         option = "--admittance" if self.latency_ms is None else "--latency-ms"
@@ -70,6 +77,8 @@ class Cell:
       about |= {"latency_ms": self._latency_ms, "admittance": self.admittance}
     if self.looks == "unseen":
       about["looks_version"] = looks.VERSION
+    if self.without:
+      about["without"] = sorted(self.without)
     return about
 
   @property
@@ -88,5 +97,5 @@ class Cell:
     draws = {"opengl": OpenGL, "tiny": Tiny}
     if self.renderer not in draws:
       return None
-    unseen = self.looks == "unseen"
+    unseen = set(looks.PARTS) - set(self.without) if self.looks == "unseen" else ()
     return draws[self.renderer](env.task.scene, env.config, unseen=unseen)

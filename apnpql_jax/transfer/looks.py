@@ -18,6 +18,12 @@ import mujoco
 import numpy as np
 
 VERSION = 1
+
+PARTS = ("surfaces", "lights", "shadows", "clutter", "camera")
+"""Parts of an unseen look: textures of table, robot and objects; two colored lights and
+highlights; shadows; things and walls around the workspace; faults of the cameras. What
+a look lacks is as in the scene file."""
+
 TABLES, SURFACES = 4, 6
 """Numbers of textures of tables and of other things."""
 

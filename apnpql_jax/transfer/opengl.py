@@ -6,7 +6,7 @@ field of view, and resized by area.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import mujoco
@@ -37,13 +37,18 @@ _VARIED = ("geom_rgba", "geom_size", "geom_matid", "cam_fovy")
 class OpenGL:
   """Draws worlds one after the other; belongs to the thread that made it."""
 
-  def __init__(self, scene: Scene, config: EnvConfig, *, unseen: bool):
-    """Compiles the scene again, with lights and textures; ``unseen`` uses them.
+  def __init__(self, scene: Scene, config: EnvConfig, *, unseen: Collection[str]):
+    """Compiles the scene again, with lights and textures.
+
+    Args:
+      scene: The scene.
+      config: Settings of the images.
+      unseen: The parts of unseen looks, of ``looks.PARTS``; none for plain looks.
 
     Raises:
       ConfigError: No graphics library can be loaded.
     """
-    self._sizes, self._unseen = rendered_sizes(config), unseen
+    self._sizes, self._unseen = rendered_sizes(config), frozenset(unseen)
     self.model = model = _with_textures(scene)
     self._plain = {name: getattr(model, name).copy() for name in _VARIED}
     self._data = mujoco.MjData(model)
@@ -51,8 +56,8 @@ class OpenGL:
     self._cameras = [scene.id("camera", name) for name in CAMERAS]
     self._sun = Lighting.from_model(scene.model).id
     self._lamp = model.light(_LAMP).id
-    # With unseen looks, only the lamp casts shadows, which is faster.
-    model.light_castshadow[self._sun] = not unseen
+    # Beside the lamp, the sun casts no shadows, which is faster.
+    model.light_castshadow[self._sun] = "lights" not in self._unseen
     self._tables, self._surfaces = (
       [model.material(_name(kind, i)).id for i in range(count)]
       for kind, count in (("table", looks.TABLES), ("surface", looks.SURFACES))
@@ -60,7 +65,7 @@ class OpenGL:
     model.vis.quality.offsamples = 0  # Oversampled instead.
     model.vis.quality.shadowsize = SHADOW_SIZE
     height, width = map(int, np.max(self._sizes, axis=0))
-    shadows = unseen or config.shadows
+    shadows = config.shadows or "shadows" in self._unseen
     self._view = View(model, height, width, shadows=shadows, reflections=False)
 
   def __enter__(self) -> OpenGL:
@@ -89,45 +94,50 @@ class OpenGL:
       target = getattr(self._data, name)
       target[...] = value.reshape(target.shape)
     look = looks.draw(row, self.model.nbody) if self._unseen else None
-    background = self._dress(fields, look)
+    background = self._light(fields, look)
+    self._color(fields, look)
     images = []
     for index, camera in enumerate(self._cameras):
       pixels, depth = self._view.render(
         self._data, camera, self._sizes[index], lambda scene: self._add(scene, look)
       )
-      if look is None:  # The walls of an unseen look have its color.
+      if "clutter" not in self._unseen:  # Else walls have the color of the look.
         pixels[depth == 1.0] = color_bytes(background)
-      images.append(developed(pixels, look, row, instant, index))
+      faults = look if "camera" in self._unseen else None
+      images.append(developed(pixels, faults, row, instant, index))
     return images
 
-  def _dress(self, fields: dict[str, np.ndarray], look: looks.Look | None) -> Any:
-    """Sets surfaces and lights; returns the color of the background."""
+  def _light(self, fields: dict[str, np.ndarray], look: looks.Look | None) -> Any:
+    """Sets the lights; returns the color of the background."""
     model, data = self.model, self._data
-    for name, plain in self._plain.items():
-      getattr(model, name)[...] = fields.get(name, plain)
-    light = light_of(model, fields)
-    data.light_xdir[self._sun] = light.direction
+    light, look = light_of(model, fields), look if "lights" in self._unseen else None
+    data.light_xdir[self._sun] = _unit(look.sun_dir) if look else light.direction
     model.vis.headlight.diffuse[:] = model.vis.headlight.specular[:] = 0
     model.vis.headlight.ambient[:] = look.ambient if look else light.ambient
     model.light_ambient[:] = 0
     model.light_specular[:] = look.specular if look else 0
     model.light_diffuse[self._sun] = look.sun_rgb if look else light.diffuse
     model.light_active[self._lamp] = look is not None
-    if look is None:
-      return light.background
-    data.light_xdir[self._sun] = _unit(look.sun_dir)
-    data.light_xpos[self._lamp] = look.lamp_pos
-    data.light_xdir[self._lamp] = _unit(np.array([0.5, 0.0, 0.0]) - look.lamp_pos)
-    model.light_diffuse[self._lamp] = look.lamp_rgb
-    table = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
-    model.geom_rgba[table, :3] = look.table_rgb
-    surfaces = np.array(self._surfaces)[look.surfaces[model.geom_bodyid]]
-    model.geom_matid[:] = np.where(table, self._tables[look.table], surfaces)
-    return look.backdrop
+    if look is not None:
+      data.light_xpos[self._lamp] = look.lamp_pos
+      data.light_xdir[self._lamp] = _unit(np.array([0.5, 0.0, 0.0]) - look.lamp_pos)
+      model.light_diffuse[self._lamp] = look.lamp_rgb
+    return light.background
+
+  def _color(self, fields: dict[str, np.ndarray], look: looks.Look | None) -> None:
+    """Sets sizes, colors and textures, and the fields of view."""
+    model = self.model
+    for name, plain in self._plain.items():
+      getattr(model, name)[...] = fields.get(name, plain)
+    if look is not None and "surfaces" in self._unseen:
+      table = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+      model.geom_rgba[table, :3] = look.table_rgb
+      surfaces = np.array(self._surfaces)[look.surfaces[model.geom_bodyid]]
+      model.geom_matid[:] = np.where(table, self._tables[look.table], surfaces)
 
   def _add(self, scene: mujoco.MjvScene, look: looks.Look | None) -> None:
     """Adds what an unseen look has around the workspace."""
-    if look is None:
+    if look is None or "clutter" not in self._unseen:
       return
     for axis in range(2):
       for side in (-1, 1):

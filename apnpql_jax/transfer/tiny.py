@@ -9,6 +9,7 @@ as those of ``opengl``.
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Collection
 from pathlib import Path
 import tempfile
 from typing import Any
@@ -45,8 +46,8 @@ _LIGHT_M = 3.0  # m, where the light stands for its shadows
 class Tiny:
   """Draws worlds one after the other."""
 
-  def __init__(self, scene: Scene, config: EnvConfig, *, unseen: bool):
-    """Prepares the textures; ``unseen`` uses them.
+  def __init__(self, scene: Scene, config: EnvConfig, *, unseen: Collection[str]):
+    """Prepares the textures; the arguments are those of ``OpenGL``.
 
     Raises:
       ConfigError: The scene has meshes.
@@ -56,7 +57,8 @@ class Tiny:
     if (self._geoms.types == mujoco.mjtGeom.mjGEOM_MESH).any():
       raise ConfigError(f"{scene.name}.xml has meshes, which --renderer tiny lacks")
     self._cameras = [scene.id("camera", name) for name in CAMERAS]
-    self._unseen, self._shadows = unseen, unseen or config.shadows
+    self._unseen = frozenset(unseen)
+    self._shadows = config.shadows or "shadows" in self._unseen
     self._worlds: OrderedDict[Any, _World] = OrderedDict()
     self._textures = tempfile.TemporaryDirectory()
 
@@ -83,9 +85,10 @@ class Tiny:
     look = looks.draw(row, self._model.nbody) if self._unseen else None
     world = self._world_of(field_of(self._model, fields, "geom_size"), row, look)
     world.place(poses["geom_xpos"], poses["geom_xmat"])
-    if look is None:
+    if "surfaces" not in self._unseen:
       world.color(field_of(self._model, fields, "geom_rgba"))
     background, lighting = self._lighting(fields, look)
+    faults = look if "camera" in self._unseen else None
     angles, images = field_of(self._model, fields, "cam_fovy"), []
     for index, camera in enumerate(self._cameras):
       eye, mat = (poses[name][camera] for name in ("cam_xpos", "cam_xmat"))
@@ -93,20 +96,22 @@ class Tiny:
         self._sizes[index], eye, np.reshape(mat, (3, 3)), angles[camera], lighting
       )
       pixels = np.where(pixels[..., 3:] > 0, pixels[..., :3], color_bytes(background))
-      images.append(developed(pixels.astype(np.uint8), look, row, instant, index))
+      images.append(developed(pixels.astype(np.uint8), faults, row, instant, index))
     return images
 
   def _lighting(
     self, fields: dict[str, np.ndarray], look: looks.Look | None
   ) -> tuple[Any, dict[str, Any]]:
     """Returns the color of the background, and arguments of ``getCameraImage``."""
-    if look is None:
-      light = light_of(self._model, fields)
-      background, direction = light.background, light.direction
-      color, ambient, diffuse = [1.0, 1.0, 1.0], light.ambient, light.diffuse
-    else:
-      background, direction = look.backdrop, look.sun_dir
-      ambient, diffuse = look.ambient, float(look.sun_rgb.max())
+    light = light_of(self._model, fields)
+    background, direction = light.background, light.direction
+    color, ambient, diffuse = [1.0, 1.0, 1.0], light.ambient, light.diffuse
+    if look is not None and "clutter" in self._unseen:
+      background = look.backdrop
+    look = look if "lights" in self._unseen else None
+    if look is not None:
+      direction, ambient = look.sun_dir, look.ambient
+      diffuse = float(look.sun_rgb.max())
       color = (look.sun_rgb / diffuse).tolist()
     return background, {
       "lightDirection": (-direction).tolist(),
@@ -127,7 +132,14 @@ class Tiny:
       if len(self._worlds) >= KEPT:
         self._worlds.popitem(last=False)[1].client.disconnect()
       folder = Path(self._textures.name)
-      self._worlds[key] = _World(self._model, self._geoms, sizes, look, folder)
+      self._worlds[key] = _World(
+        self._model,
+        self._geoms,
+        sizes,
+        folder,
+        surfaces=look if "surfaces" in self._unseen else None,
+        clutter=look if "clutter" in self._unseen else None,
+      )
     self._worlds.move_to_end(key)
     return self._worlds[key]
 
@@ -140,8 +152,10 @@ class _World:
     model: mujoco.MjModel,
     geoms: Geoms,
     sizes: np.ndarray,
-    look: looks.Look | None,
     folder: Path,
+    *,
+    surfaces: looks.Look | None = None,
+    clutter: looks.Look | None = None,
   ):
     self.client = connect()
     self._folder, self._ids, self._colors = folder, geoms.ids, {}
@@ -149,12 +163,12 @@ class _World:
     self._bodies = []
     for geom, kind, rgb in zip(geoms.ids, geoms.types, geoms.colors, strict=True):
       kind, texture = int(kind), None
-      if look and kind == mujoco.mjtGeom.mjGEOM_PLANE:
-        rgb, texture = look.table_rgb, ("table", look.table)
-      elif look:
-        texture = "surface", int(look.surfaces[model.geom_bodyid[geom]])
+      if surfaces and kind == mujoco.mjtGeom.mjGEOM_PLANE:
+        rgb, texture = surfaces.table_rgb, ("table", surfaces.table)
+      elif surfaces:
+        texture = "surface", int(surfaces.surfaces[model.geom_bodyid[geom]])
       self._bodies.append(self._add(kind, sizes[geom], rgb, texture))
-    for thing in look.clutter if look else ():
+    for thing in clutter.clutter if clutter else ():
       body = self._add(thing.shape, thing.size, thing.rgb, ("surface", thing.surface))
       self._put(body, thing.pos, thing.mat)
 

@@ -8,6 +8,7 @@ the draws of the randomizer, OpenGL with unseen looks. In Bullet: TinyRenderer w
 plain and with unseen looks.
 """
 
+from collections.abc import Collection
 import dataclasses
 from typing import Any
 
@@ -21,6 +22,7 @@ from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.envs.state import EnvState
 from apnpql_jax.training.rollout import expert_policy, rollout
+from apnpql_jax.transfer import looks
 from apnpql_jax.transfer.opengl import OpenGL
 from apnpql_jax.transfer.tiny import Tiny
 from apnpql_jax.transfer.transfer import make_draw
@@ -47,15 +49,15 @@ def sheet(config: EnvConfig) -> list[np.ndarray]:
   state = played(env)
   seen: Any = state.timestep.observation
   rows = [joined(seen.global_image, seen.wrist_image)]
-  rows.append(drawn(env, state, OpenGL, unseen=False))
+  rows.append(drawn(env, state, OpenGL, unseen=()))
   randomized = make_env(dataclasses.replace(config, randomize=True))
-  rows.append(drawn(randomized, played(randomized), OpenGL, unseen=False))
-  rows.append(drawn(env, state, OpenGL, unseen=True))
+  rows.append(drawn(randomized, played(randomized), OpenGL, unseen=()))
+  rows.append(drawn(env, state, OpenGL, unseen=looks.PARTS))
   with Worlds(env, latency_s=0.03, admittance=False) as worlds:
     state, act = env.reset(jnp.asarray(ROWS)), jax.jit(env.expert_action)
     for _ in range(PERIODS):
       state = env.observe(worlds.advance(state, act(state), np.ones(WORLDS, bool)))
-  rows += [drawn(env, state, Tiny, unseen=unseen) for unseen in (False, True)]
+  rows += [drawn(env, state, Tiny, unseen=unseen) for unseen in ((), looks.PARTS)]
   return rows
 
 
@@ -67,7 +69,7 @@ def played(env: Env) -> EnvState:
 
 
 def drawn(
-  env: Env, state: EnvState, renderer: type[OpenGL | Tiny], *, unseen: bool
+  env: Env, state: EnvState, renderer: type[OpenGL | Tiny], *, unseen: Collection[str]
 ) -> np.ndarray:
   """Returns a row of tiles by a renderer."""
   with renderer(env.task.scene, env.config, unseen=unseen) as opened:

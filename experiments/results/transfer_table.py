@@ -6,6 +6,7 @@
   python experiments/results/transfer_table.py expert:stack_box
 
 A cell is physics/renderer/looks and, with Bullet, the latency in ms and "admittance".
+Looks such as unseen-shadows are unseen ones without a part.
 `apnpql transfer` plays every cell of every run in a process of its own, and the result
 is stored as <folder>/<run>-<cell>.json. The same command again plays only what is
 missing. It refuses a stored result of another seed, checkpoint or setting. Then it
@@ -73,7 +74,8 @@ def cell_of(text: str) -> Cell:
     shape = f"physics/renderer/looks[/latency in ms][/{ADMITTANCE}]"
     raise ConfigError(f"cell {text!r} must have the form {shape}")
   latency_ms = int(latency[0]) if latency else None
-  cell = Cell(*names, latency_ms=latency_ms, admittance=admittance)
+  looks, *without = names[2].split("-")
+  cell = Cell(*names[:2], looks, tuple(without), latency_ms, admittance)
   cell.check()
   return cell
 
@@ -81,7 +83,7 @@ def cell_of(text: str) -> Cell:
 def name_of(cell: Cell) -> str:
   """Returns the part of a file's name that stands for a cell."""
   about = cell.about()
-  parts = [cell.physics, cell.renderer, cell.looks]
+  parts = [cell.physics, cell.renderer, cell.looks, *about.get("without", ())]
   if "latency_ms" in about:
     parts += [str(about["latency_ms"]), *[ADMITTANCE] * cell.admittance]
   return "-".join(parts)
@@ -107,6 +109,8 @@ def options_of(run: str, cell: Cell) -> list[str]:
   for name in ("physics", "renderer", "looks", "latency_ms"):
     if name in about:
       options += [f"--{name.replace('_', '-')}", str(about[name])]
+  if cell.without:
+    options += ["--without", *cell.without]
   return [*options, *["--admittance"] * cell.admittance]
 
 
@@ -226,10 +230,15 @@ def together(found: list[dict[str, Any]]) -> str:
 
 def cell_label(found: dict[str, Any]) -> str:
   """Returns the name of a result's cell."""
-  parts = [found[name] for name in ("physics", "renderer", "looks")]
+  parts = [found["physics"], found["renderer"], looks_of(found)]
   if "latency_ms" in found:
     parts.append(f"{found['latency_ms']} ms")
   return listed([*parts, *["admittance"] * found.get("admittance", False)])
+
+
+def looks_of(found: dict[str, Any]) -> str:
+  """Returns the looks of a result, as in the name of its cell."""
+  return "-".join([found["looks"], *found.get("without", ())])
 
 
 def row_of(found: dict[str, Any]) -> list[str]:
@@ -241,7 +250,8 @@ def row_of(found: dict[str, Any]) -> list[str]:
   return [
     *(found[name] for name in ("run", "task")),
     found.get("trained", "-"),
-    *(found[name] for name in ("physics", "renderer", "looks")),
+    *(found[name] for name in ("physics", "renderer")),
+    looks_of(found),
     latency,
     admittance,
     f"{found['successes']} of {found['episodes']}",
@@ -261,6 +271,7 @@ def cell_order(found: dict[str, Any]) -> tuple[Any, ...]:
     ("mjx", "native", "bullet").index(found["physics"]),
     ("rays", "opengl", "tiny").index(found["renderer"]),
     ("plain", "trained", "unseen").index(found["looks"]),
+    looks_of(found),
     found.get("admittance", False),
     found.get("latency_ms", 0),
   )

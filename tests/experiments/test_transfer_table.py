@@ -63,6 +63,10 @@ def test_cells_are_options_of_the_command():
   args = parse(command.Transfer, "transfer", transfer_table.options_of("a/b", cell))
   assert (args.physics, args.renderer, args.looks) == ("bullet", "tiny", "unseen")
   assert (args.run, args.latency_ms, args.admittance) == ("a/b", 60, True)
+  cell = cell_of("native/opengl/unseen-shadows-lights")
+  args = parse(command.Transfer, "transfer", transfer_table.options_of("a/b", cell))
+  assert (args.looks, args.without) == ("unseen", ("shadows", "lights"))
+  assert transfer_table.name_of(cell) == "native-opengl-unseen-lights-shadows"
   cell = cell_of("native/rays/plain")
   words = transfer_table.options_of("expert:stack_box", cell)
   args = parse(command.Transfer, "transfer", words)
@@ -89,6 +93,7 @@ def test_a_cell_has_one_name():
     ("bullet/rays/plain/fast", "must have the form"),
     ("bullet/rays/plain/admittance/30", "must have the form"),
     ("native/rays/unseen", "--looks unseen needs"),
+    ("native/opengl/plain-clutter", "--without needs --looks unseen"),
     ("native/rays/plain/30", "--latency-ms needs --physics bullet"),
   ],
 )

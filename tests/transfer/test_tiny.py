@@ -16,7 +16,7 @@ from apnpql_jax.envs.cameras import make_cameras
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.randomization.randomize import make_randomize
 from apnpql_jax.sim.physics import PhysicsState
-from apnpql_jax.transfer import tiny
+from apnpql_jax.transfer import looks, tiny
 from apnpql_jax.transfer.tiny import Tiny
 from apnpql_jax.transfer.transfer import make_draw
 
@@ -32,7 +32,7 @@ def env() -> Env:
 
 @pytest.fixture(scope="module")
 def plain(env: Env) -> Iterator[Tiny]:
-  with Tiny(env.task.scene, CONFIG, unseen=False) as renderer:
+  with Tiny(env.task.scene, CONFIG, unseen=()) as renderer:
     yield renderer
 
 
@@ -69,7 +69,7 @@ def test_tiny_sees_what_the_ray_caster_sees(randomize, plain, env, state):
 
 
 def test_unseen_looks_differ_by_row_and_noise_by_time(plain, env, state):
-  with Tiny(env.task.scene, CONFIG, unseen=True) as strange:
+  with Tiny(env.task.scene, CONFIG, unseen=looks.PARTS) as strange:
     first, again = (images(strange, env, state, time=5) for _ in range(2))
     later, known = images(strange, env, state, time=6), images(plain, env, state)
   for a, b, c, d in zip(first, again, later, known, strict=True):
@@ -81,7 +81,7 @@ def test_unseen_looks_differ_by_row_and_noise_by_time(plain, env, state):
 
 def test_few_worlds_stay_loaded(env, state, plain, monkeypatch):
   monkeypatch.setattr(tiny, "KEPT", 2)
-  with Tiny(env.task.scene, CONFIG, unseen=True) as strange:
+  with Tiny(env.task.scene, CONFIG, unseen=looks.PARTS) as strange:
     for view, other in zip(
       images(strange, env, state), images(strange, env, state), strict=True
     ):
@@ -100,7 +100,7 @@ def test_shapes_of_clutter_have_the_silhouettes_of_mujoco(name, tmp_path):
   data = mujoco.MjData(model)
   mujoco.mj_forward(model, data)
   geoms = tiny.Geoms.from_model(model)
-  world = tiny._World(model, geoms, model.geom_size, None, tmp_path)
+  world = tiny._World(model, geoms, model.geom_size, tmp_path)
   world.place(data.geom_xpos, data.geom_xmat)
   mat = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
   height, width, fovy = 80, 120, 30.0

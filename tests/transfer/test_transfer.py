@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -51,15 +51,15 @@ def env() -> Env:
 
 @pytest.fixture(scope="module")
 def plain(env: Env) -> Iterator[OpenGL]:
-  yield from opened(env.task.scene, OpenGL, unseen=False)
+  yield from opened(env.task.scene, OpenGL, unseen=())
 
 
 @pytest.fixture(scope="module")
 def strange(env: Env) -> Iterator[OpenGL]:
-  yield from opened(env.task.scene, OpenGL, unseen=True)
+  yield from opened(env.task.scene, OpenGL, unseen=looks.PARTS)
 
 
-def opened(scene: Scene, renderer: type, *, unseen: bool) -> Iterator[Any]:
+def opened(scene: Scene, renderer: type, *, unseen: Collection[str]) -> Iterator[Any]:
   try:
     gl = renderer(scene, CONFIG, unseen=unseen)
   except ConfigError as error:
@@ -173,7 +173,7 @@ def test_background_has_the_color_of_the_ray_caster(renderer):
   names = "geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat"
   poses = {name: np.array(getattr(data, name)) for name in names}
   expected = 255 * np.array(Lighting().background)
-  for gl in opened(scene, renderer, unseen=False):
+  for gl in opened(scene, renderer, unseen=()):
     _, wrist = gl.draw(poses, {}, row=0, instant=0)
     sky = (np.abs(wrist - expected) < 1).all(-1)
     assert sky.mean() > 0.02 and sky[0].any()
@@ -194,6 +194,27 @@ def test_unseen_looks_follow_from_version_and_row(strange, plain, env, state):
   textures = [looks.table_texture(i) for i in range(looks.TABLES)]
   textures += [looks.surface_texture(i) for i in range(looks.SURFACES)]
   assert len({x.tobytes() for x in textures}) == looks.TABLES + looks.SURFACES
+
+
+@pytest.mark.parametrize("renderer", [OpenGL, Tiny])
+def test_each_part_of_unseen_looks_changes_the_images(renderer, env, state):
+  if renderer is Tiny:
+    pytest.importorskip("pybullet")
+  found = []
+  chosen = [set(looks.PARTS) - {part} for part in looks.PARTS]
+  for unseen in (looks.PARTS, *chosen):
+    for drawing in opened(env.task.scene, renderer, unseen=unseen):
+      found.append(np.concatenate([x.ravel() for x in images(drawing, env, state)]))
+  assert len({x.tobytes() for x in found}) == 1 + len(looks.PARTS)
+
+
+@pytest.mark.parametrize("part", looks.PARTS)
+def test_a_part_of_unseen_looks_is_one_change_of_plain_ones(part, plain, env, state):
+  known, everywhere = images(plain, env, state), ("surfaces", "lights", "camera")
+  for drawing in opened(env.task.scene, OpenGL, unseen=[part]):
+    difference = np.abs(images(drawing, env, state)[0].astype(int) - known[0])
+    changed = (difference > 4).any(-1).mean()
+    assert changed > 0.5 if part in everywhere else 0.005 < changed < 0.5
 
 
 def test_clutter_stays_out_of_the_workspace():
@@ -236,6 +257,11 @@ def test_expert_is_measured_with_its_interval(monkeypatch):
     (Cell(renderer="paint"), "'paint'; choose from rays, opengl"),
     (Cell(looks="new"), "'new'; choose from trained, plain, unseen"),
     (Cell(looks="unseen"), "unseen needs --renderer opengl"),
+    (Cell(renderer="opengl", without=("clutter",)), "--without needs --looks unseen"),
+    (
+      Cell(renderer="opengl", looks="unseen", without=("dust",)),
+      "'dust'; choose from surfaces, lights, shadows",
+    ),
   ],
 )
 def test_unknown_cells_are_refused(cell, words):
