@@ -72,7 +72,8 @@ def transfer(
   Returns:
     The conditions, see ``conditions.of_run``; the success rate with its Wilson
     interval; the mean length in control periods; failures by their last stage, as in
-    ``diagnose``; and the time that it took, s.
+    ``diagnose``; the rows of the reset bank that failed, which have the same worlds in
+    all cells; and the time that it took, s.
 
   Raises:
     ConfigError: An argument is invalid, or a package or library is missing.
@@ -234,5 +235,6 @@ def _summary(
     "ci95": wilson_interval(solved, episodes),
     "mean_length": float(np.concatenate([x.length for x in played]).mean()),
     "failures": dict(failures),
+    "failed_rows": np.concatenate([x.rows for x in played])[~success].tolist(),
     "wall_s": time.monotonic() - began,
   }

@@ -248,6 +248,7 @@ def test_expert_is_measured_with_its_interval(monkeypatch):
   assert low <= found["success_rate"] <= high
   assert found["success_rate"] == pytest.approx(found["successes"] / 3)
   assert sum(found["failures"].values()) == 3 - found["successes"]
+  assert len(found["failed_rows"]) == 3 - found["successes"]
 
 
 @pytest.mark.parametrize(
