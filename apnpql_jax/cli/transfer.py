@@ -49,7 +49,7 @@ class Transfer(OfRun):
   """trained: worlds that domain randomization draws; plain: no randomization; unseen:
   textures, lights, shadows, clutter and noise that it cannot draw."""
 
-  without: tuple[str, ...] = ()
+  without: Annotated[tuple[str, ...], default_hint("(default: none)")] = ()
   """Parts that unseen looks lack, to find out which one matters: surfaces, lights,
   shadows, clutter or camera."""
 

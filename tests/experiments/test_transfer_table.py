@@ -11,6 +11,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import pytest
+import transfer_results
 import transfer_table
 from transfer_table import cell_of
 
@@ -224,7 +225,7 @@ def test_seeds_of_a_training_are_one_sample():
   middle = p + z**2 / (2 * n)
   spread = z * math.sqrt(p * (1 - p) / n + (z / (2 * n)) ** 2)
   low, high = ((middle + s * spread) / (1 + z**2 / n) for s in (-1, 1))
-  head, _, plain, moved = transfer_table.by_training(results).splitlines()
+  head, _, plain, moved = transfer_results.by_training(results).splitlines()
   assert head == "| tested in | a | b |"
   both = f"170 + 190 of 400, {100 * low:.0f} to {100 * high:.0f} %"
   assert plain == f"| native, rays, plain | {both} | 10 of 200, 3 to 9 % |"
@@ -233,10 +234,10 @@ def test_seeds_of_a_training_are_one_sample():
   )
 
 
-@pytest.mark.parametrize("folder", ["", "pilot"])
+@pytest.mark.parametrize("folder", ["", "parts", "pilot"])
 def test_the_documents_have_the_stored_results(folder):
   out, document = transfer_table.OUT / folder, testing.ROOT / "docs" / "transfer.md"
-  found = [transfer_table.read(path) for path in out.glob("*.json")]
-  table, summary = transfer_table.table(found), transfer_table.by_training(found)
+  found = [transfer_results.read(path) for path in out.glob("*.json")]
+  table, summary = transfer_results.table(found), transfer_results.by_training(found)
   assert len(found) > 0 and (out / "table.md").read_text() == table
-  assert (table if folder else summary) in document.read_text()
+  assert (table if folder == "pilot" else summary) in document.read_text()
