@@ -114,9 +114,10 @@ def measure(run: Path) -> dict[str, Any]:
       if process.poll() is not None or time.monotonic() > deadline:
         raise RuntimeError(output.read_text(errors="replace")[-2000:])
       time.sleep(0.2)
-      if (found := memory(process.pid)) is None:
-        continue
-      peak, now = found
+      try:
+        peak, now = memory(process.pid)
+      except ProcessLookupError:
+        continue  # It has ended.
       rows = testing.rows(run)
       saved = [row for row in rows if "checkpoint/wall_s" in row]
       steady += [now] if saved else []
@@ -135,16 +136,18 @@ def measure(run: Path) -> dict[str, Any]:
   }
 
 
-def memory(pid: int) -> tuple[int, int] | None:
+def memory(pid: int) -> tuple[int, int]:
   """Returns the largest and the present resident memory of a process in bytes.
 
-  One that has ended has none.
+  Raises:
+    ProcessLookupError: It has ended.
   """
   lines = Path(f"/proc/{pid}/status").read_text().splitlines()
   status = dict(line.split(":", 1) for line in lines)
   if "VmHWM" not in status:
-    return None
-  return 1024 * int(status["VmHWM"].split()[0]), 1024 * int(status["VmRSS"].split()[0])
+    raise ProcessLookupError(f"process {pid} has ended")
+  peak, now = (1024 * int(status[key].split()[0]) for key in ("VmHWM", "VmRSS"))
+  return peak, now
 
 
 if __name__ == "__main__":
