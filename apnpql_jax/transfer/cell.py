@@ -78,7 +78,7 @@ class Cell:
     if self.looks == "unseen":
       about["looks_version"] = looks.VERSION
     if self.without:
-      about["without"] = sorted(self.without)
+      about["without"] = sorted(set(self.without))
     return about
 
   @property

@@ -56,7 +56,7 @@ class OpenGL:
     self._cameras = [scene.id("camera", name) for name in CAMERAS]
     self._sun = Lighting.from_model(scene.model).id
     self._lamp = model.light(_LAMP).id
-    # Beside the lamp, the sun casts no shadows, which is faster.
+    # The sun casts shadows only without the lamp: one shadow map is faster.
     model.light_castshadow[self._sun] = "lights" not in self._unseen
     self._tables, self._surfaces = (
       [model.material(_name(kind, i)).id for i in range(count)]
