@@ -5,9 +5,10 @@ Inside jit a reset only gathers a random row, so random resets cost nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 import concurrent.futures
 from concurrent.futures.process import BrokenProcessPool
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -145,12 +146,7 @@ def build_bank(
   report = BankReport()
   kept: list[ResetBank] = []
   unfailing: Any = Unfailing(sys.stderr)
-  # Spawn, because forking a process in which XLA threads run can deadlock.
-  context = multiprocessing.get_context("spawn")
-  with (
-    concurrent.futures.ProcessPoolExecutor(cores(), context, end_with_parent) as pool,
-    Progress(console=Console(file=unfailing)) as progress,
-  ):
+  with _workers() as pool, Progress(console=Console(file=unfailing)) as progress:
     bar = progress.add_task(f"reset bank of {task.name}", total=rows)
     while (missing := rows - sum(bank.rows for bank in kept)) > 0:
       progress.update(bar, completed=rows - missing)
@@ -165,6 +161,32 @@ def build_bank(
     report.seconds = time.monotonic() - began
     progress.console.print(f"reset bank of {task.name}: {report}", highlight=False)
   return jax.tree.map(lambda *parts: jnp.concatenate(parts), *kept), report
+
+
+@contextlib.contextmanager
+def _workers() -> Generator[concurrent.futures.Executor]:
+  """Yields worker processes, one per core; they end together.
+
+  Raises:
+    UserError: A worker process died.
+  """
+  others = set(multiprocessing.active_children())
+  # Spawn, because forking a process in which XLA threads run can deadlock.
+  context = multiprocessing.get_context("spawn")
+  with concurrent.futures.ProcessPoolExecutor(
+    cores(), context, end_with_parent
+  ) as pool:
+    try:
+      yield pool
+    except BrokenProcessPool:
+      # The pool ends its workers, but not one that started in the meantime, and would
+      # wait for that one forever.
+      for process in set(multiprocessing.active_children()) - others:
+        process.kill()
+      raise UserError(
+        "a worker process for the reset bank died; free some memory, and keep the "
+        'guard `if __name__ == "__main__":` in a script'
+      ) from None
 
 
 def _settled(
@@ -201,15 +223,9 @@ def _solve_targets(
   arrays = starts, positions, rotations
   chunks = [np.split(x, range(CHUNK, len(x), CHUNK)) for x in arrays]
   solved = []
-  try:
-    for result in pool.map(ik.solve_all, *chunks):
-      solved.append(result)
-      advance(len(result[0]))
-  except BrokenProcessPool:
-    raise UserError(
-      "a worker process for the reset bank died; free some memory, and keep the "
-      'guard `if __name__ == "__main__":` in a script'
-    ) from None
+  for result in pool.map(ik.solve_all, *chunks):
+    solved.append(result)
+    advance(len(result[0]))
   targets, residuals = map(np.concatenate, zip(*solved, strict=True))
   reached = (residuals < [ik.POSITION_TOLERANCE, ik.ROTATION_TOLERANCE]).all((1, 2))
   reached &= np.abs(targets - starts[:, None]).max((1, 2)) < MAX_TRAVEL

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 
 from apnpql_jax import testing
+from apnpql_jax.errors import UserError
 from apnpql_jax.primitives import ik, reset_bank, tracking
 from apnpql_jax.sim import arm, physics
 from apnpql_jax.sim.kinematics import make_kinematics
@@ -114,10 +116,11 @@ def test_bank_rejects_overlapping_and_unreachable_draws(capsys):
 BUILD = """
 import multiprocessing, threading, time
 from apnpql_jax.primitives.reset_bank import build_bank
+from apnpql_jax.runtime import cores
 from apnpql_jax.tasks import make_task
 
 def report():
-  while not multiprocessing.active_children():
+  while len(multiprocessing.active_children()) < min(cores(), 4):
     time.sleep(0.01)
   print(multiprocessing.active_children()[0].pid, flush=True)
 
@@ -150,6 +153,16 @@ def test_a_killed_worker_ends_the_build_with_one_line():
   _, shown = process.communicate(timeout=60)
   assert process.returncode == 1
   assert "UserError: a worker process for the reset bank died" in shown
+
+
+def test_a_worker_that_starts_while_the_others_end_ends_too():
+  """The pool knows nothing of it, but would wait for it."""
+  with pytest.raises(UserError, match="died"), reset_bank._workers() as pool:
+    late = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(600,))
+    late.start()
+    pool.submit(os._exit, 1).result()
+  late.join(20)
+  assert late.exitcode == -signal.SIGKILL
 
 
 def test_refinement_agrees_with_mink(task, small_bank):

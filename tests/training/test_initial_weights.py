@@ -140,6 +140,7 @@ def test_settings_of_weights_are_all_that_change_their_shapes():
     "algorithm": tuple(ALGORITHMS),
     "candidate_precision": ("bfloat16",),
     "temperature": ("shared", "fixed"),
+    "alpha_floor": ("clip",),
     "regularizer": ("uniform",),
     "policy_evaluation": ("td0", "clipped_double_q"),
     "prior_mean": ("learned",),
