@@ -29,8 +29,8 @@ from benchmarks.peers.compare import PEERS, RATES
 DOC = store.ROOT / "docs" / "performance.md"
 BLOCKS = (
   *("fidelity", "render", "ray_layouts", "learner", "timeline", "encoder_layouts"),
-  *("env_steps", "end_to_end", "compile_time", "growth", "memory", "peers"),
-  "stable_baselines",
+  *("env_steps", "physics_timeline", "end_to_end", "compile_time", "growth"),
+  *("memory", "peers", "stable_baselines"),
 )
 PANELS = 3  # panels of a plot side by side
 

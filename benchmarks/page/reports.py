@@ -42,6 +42,7 @@ COLUMNS = {
   "|bfloat16, updates/s=bfloat16.updates_per_s"
   "|repeated, updates/s=repeated.updates_per_s|ratio",
   "timeline": "part|ms|share=share:share",
+  "physics_timeline": "part|ms|share=share:share",
   "encoder_layouts": "encoder=layout|updates/s=updates_per_s:rate"
   "|share of the images=images:share",
   "env_steps": "task|backend|obs|worlds|env, steps/s=env.steps_per_s:rate"

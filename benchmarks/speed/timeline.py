@@ -56,7 +56,8 @@ def measure_all(config: TrainConfig, args: argparse.Namespace) -> Iterator[Resul
   updates = ready.units * args.repeats
   times = timing.measure({"": ready}, repeats=args.repeats)[""]
   parts: dict[str, float] = collections.defaultdict(float)
-  for operation, seconds in traced(ready, args.repeats):
+  origin = dict(_OPERATION.findall(text_of(ready)))
+  for operation, seconds in traced(ready, args.repeats, origin):
     parts[part_of(operation)] += seconds
   total = sum(parts.values())
   for part, seconds in sorted(parts.items(), key=lambda item: -item[1]):
@@ -64,10 +65,19 @@ def measure_all(config: TrainConfig, args: argparse.Namespace) -> Iterator[Resul
   yield {"part": "an update, by the clock", "ms": 1e3 * times.seconds}
 
 
-def traced(ready: timing.Ready, calls: int) -> Iterator[tuple[str, float]]:
-  """Yields (where an operation was written, seconds) of ``calls`` of a program."""
+def text_of(ready: timing.Ready) -> str:
+  """Returns the compiled program as text."""
   program: Any = ready.run  # A partial call of what was compiled.
-  origin = dict(_OPERATION.findall(program.func.as_text()))
+  return program.func.as_text()
+
+
+def traced(
+  ready: timing.Ready, calls: int, origin: dict[str, str]
+) -> Iterator[tuple[str, float]]:
+  """Yields (where an operation was written, seconds) of ``calls`` of a program.
+
+  ``origin`` maps the names of operations to where they were written.
+  """
   with tempfile.TemporaryDirectory() as folder:
     with jax.profiler.trace(folder):
       for _ in range(calls):

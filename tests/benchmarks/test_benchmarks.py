@@ -38,7 +38,7 @@ from benchmarks.common import (
 from benchmarks.page import performance, reports
 from benchmarks.quality import tasks
 from benchmarks.reliability import resume, soak
-from benchmarks.speed import messages, ray_layouts, render
+from benchmarks.speed import messages, physics_timeline, ray_layouts, render
 
 MACHINE = {
   "device": "a machine",
@@ -84,6 +84,7 @@ def dicts(tree: Any) -> Iterator[dict[str, Any]]:
     ("learner", []),
     ("learner", ["--lstm-instants", "2", "--phi", "once"]),
     ("timeline", []),
+    ("physics_timeline", []),
     ("seeds", ["--obs", "state"]),
     ("encoder_layouts", []),
     ("env_steps", []),
@@ -234,6 +235,21 @@ def test_shares_add_up_even_if_parts_are_slower_alone():
 
   assert shares(4.0, a=1.0, b=2.0) == [0.25, 0.5, 0.25]
   assert shares(2.0, a=1.0, b=3.0) == [0.25, 0.75, 0.0]
+
+
+def sine(x):
+  return jnp.sin(x)
+
+
+def accumulated_sine(x):
+  return jnp.cumsum(sine(x)) + 1.0
+
+
+def test_operations_belong_to_the_functions_they_were_written_in():
+  program: Any = jax.jit(accumulated_sine).lower(jnp.ones(8)).compile()
+  found = physics_timeline.functions(program.as_text(), "accumulated_sine")
+  kinds = {name.partition(".")[0]: part for name, part in found.items()}
+  assert (kinds["sin"], kinds["add"]) == ("sine", "rest")
 
 
 def test_messages_are_read_from_a_program():
