@@ -215,7 +215,8 @@ class Convert(Command):
 
   recording: tyro.conf.Positional[str] = ""
   """Joint trajectories and object poses (docs/demonstrations.md), another
-  demonstrations file, or the folder of a dataset of LeRobot."""
+  demonstrations file, or the folder of a dataset of LeRobot, such as the log of a
+  simulated robot."""
 
   task: tyro.conf.Positional[str] = ""
   """Task of the recording, or the path of its file; `apnpql list` shows all."""

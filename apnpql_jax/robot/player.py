@@ -89,7 +89,8 @@ class Player:
     Args:
       robot: The robot.
       board: The board.
-      cameras: The cameras, connected; the first has ``solved`` if the robot can judge.
+      cameras: The cameras, connected; the first has ``solved`` and ``environment`` if
+        the robot can judge.
       act: The policy.
       recorder: Gets each episode.
       ending: Ends the episode when it is set.
@@ -98,6 +99,7 @@ class Player:
     self._contract, self._recorder = robot.contract, recorder
     self._clock, self._ending = robot.clock, ending or threading.Event()
     self._judge = getattr(cameras[0], "solved", None)
+    self._environment = getattr(cameras[0], "environment", lambda: None)
     self._observer = Observer(robot.contract)
     self._order, self._solved, self._ended = 0, False, 0
 
@@ -127,26 +129,41 @@ class Player:
     most = round(self._contract["time_limit_s"] / period)
     self._observer.begin()
     begin, number, actions = self._clock.now(), 0, 0
+    action = np.zeros(7)
     while True:
       frames = [camera.get_observation() for camera in self._cameras]
       state = self.board["state"].read()
       if self._is_over(state):
         return
       self._solved = bool(self._judge and actions and self._judge())
-      if self._solved or number >= most:
+      if self._solved or number >= most:  # What the last action has led to.
+        rest = np.append(np.zeros(6), action[6])
+        self._record(begin, self._clock.now(), state, rest, frames)
         return
       seen = self._observer.observe(state["position"], float(state["gripper"]), frames)
       action = self._act(seen, episode, actions)
       now, actions = self._clock.now(), actions + 1
       self._send(actions, now, action, frames)
-      if self._recorder is not None:
-        self._recorder.add(begin, now, state, action, frames)
+      self._record(begin, now, state, action, frames)
       delay = now - begin - number * period
       number = next_period(number, now - begin, period)
       self.board["policy"].write(
         {"actions": actions, "missed": min(number, most) - actions, "delay": delay}
       )
       self._wait(begin + number * period)
+
+  def _record(
+    self,
+    begin: float,
+    now: float,
+    state: Any,
+    action: np.ndarray,
+    frames: Sequence[Frame],
+  ) -> None:
+    """Keeps an instant for the log, if there is one; see ``Recorder.add``."""
+    if self._recorder is not None:
+      environment = self._environment()
+      self._recorder.add(begin, now, state, action, frames, environment)
 
   def _is_over(self, state: Any) -> bool:
     playing = state["number"] == self._order and state["phase"] == Phase.PLAY

@@ -124,6 +124,7 @@ def main(robot: Robot, board_name: str, options: dict[str, Any], peer: Pipe) -> 
             Path(options["log"]),
             folder.contract,
             judged=robot.can_judge,
+            environment=getattr(cameras[0], "environment_names", tuple)(),
             devices=_described(robot, board, cameras),
           )
         )

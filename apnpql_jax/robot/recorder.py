@@ -15,9 +15,6 @@ from apnpql_jax.robot.supervisor import CAMERAS
 ROBOT_TYPE = "ur5e_rh_p12_rn"
 _COMMAND = "observation.command"
 _WRENCH = "observation.wrench"
-_TIMES = "times"
-"""Column of times since the beginning of the episode, s. Its name makes it no input of
-LeRobot's policies, which take all columns of "observation"."""
 _AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
 
 
@@ -30,6 +27,7 @@ class Recorder:
     contract: dict[str, Any],
     *,
     judged: bool,
+    environment: Sequence[str] = (),
     devices: dict[str, Any] | None = None,
   ):
     """Makes the folder.
@@ -38,6 +36,8 @@ class Recorder:
       folder: Folder to make.
       contract: That of the policy.
       judged: Whether the success of an episode is known, see ``lerobot.Writer``.
+      environment: Names of the numbers in the state of the scene, if it is known; see
+        ``conversion.state_names``.
       devices: What the devices say of themselves, see ``Device.describe``.
 
     Raises:
@@ -47,6 +47,7 @@ class Recorder:
     joints = contract["joints"]["state"]
     cameras = contract["cameras"]
     self._task, self._rows, self._count = contract["task"], [], 0
+    known = {lerobot.ENVIRONMENT: tuple(environment)} if environment else {}
     self._writer = lerobot.Writer(
       folder,
       fps=1 / contract["control_period_s"],
@@ -55,7 +56,8 @@ class Recorder:
         lerobot.ACTION: tuple(contract["action"]["order"]),
         _COMMAND: tuple(joints[:6]),
         _WRENCH: _AXES,
-        _TIMES: (*CAMERAS, "joints", "gripper", "action"),
+        lerobot.TIMES: (*CAMERAS, "joints", "gripper", "action"),
+        **known,
       },
       images={
         f"{lerobot.IMAGES}{name}": (
@@ -82,6 +84,7 @@ class Recorder:
     state: Any,
     action: np.ndarray,
     frames: Sequence[Frame],
+    environment: np.ndarray | None = None,
   ) -> None:
     """Keeps an instant.
 
@@ -91,6 +94,7 @@ class Recorder:
       state: Record "state" of the board.
       action: The action f32[7].
       frames: What the cameras saw.
+      environment: State of the scene at that moment f32[k], if the log has it.
     """
     times = [*(x.time for x in frames), state["time"], state["gripper_time"], now]
     row = {
@@ -98,10 +102,12 @@ class Recorder:
       lerobot.ACTION: action,
       _COMMAND: state["command"],
       _WRENCH: state["wrench"],
-      _TIMES: np.array(times) - begin,
+      lerobot.TIMES: np.array(times) - begin,
     }
     for name, frame in zip(CAMERAS, frames, strict=True):
       row[f"{lerobot.IMAGES}{name}"] = frame.image
+    if environment is not None:
+      row[lerobot.ENVIRONMENT] = environment
     self._rows.append(row)
 
   def end_episode(self, success: bool | None) -> int | None:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from apnpql_jax.config import files
+from apnpql_jax.data.lerobot import conversion
 from apnpql_jax.envs.cameras import make_cameras
 from apnpql_jax.robot.board import Board
 from apnpql_jax.robot.protocols import Frame
@@ -49,11 +50,16 @@ class View:
     self._board = Board(plant, RECORDS)
     self.frames: list[Frame] = []
     self.solved = False
+    self.environment = np.zeros(0, np.float32)
 
   def look(self) -> None:
-    """Draws both cameras, and judges whether the task is solved."""
+    """Draws both cameras, judges whether the task is solved, and keeps the state."""
     found = self._board["plant"].read()
-    *images, solved = jax.device_get(self._draw(state_of(self.task, found)))
+    state = state_of(self.task, found)
+    *images, solved = jax.device_get(self._draw(state))
+    arrays = state.qpos, state.qvel, state.mocap_pos, state.mocap_quat
+    variant = np.array([found["variant"]])
+    (self.environment,) = conversion.states(*map(np.asarray, arrays), variant)
     time = float(found["time"])
     self.frames = [Frame(time, np.asarray(image)) for image in images]
     self.solved = bool(solved)
@@ -108,6 +114,14 @@ class SimulatedCamera:
   def solved(self) -> bool:
     """Returns whether the task was solved at the newest frame."""
     return self._view.solved
+
+  def environment_names(self) -> list[str]:
+    """Returns the names of the numbers in ``environment``."""
+    return conversion.state_names(self._view.task.scene)
+
+  def environment(self) -> np.ndarray:
+    """Returns the state of the scene that the newest frame shows, f32[k]."""
+    return self._view.environment
 
 
 def make(plant: str, contract: dict[str, Any]) -> list[SimulatedCamera]:

@@ -39,7 +39,9 @@ def write_dataset(
   """
   scene = task.scene
   robot = [*scene.arm_qpos, scene.gripper_qpos]
-  states = conversion.states(demos)
+  states = conversion.states(
+    demos.qpos, demos.qvel, demos.mocap_pos, demos.mocap_quat, demos.variant
+  )
   solved = demonstrations.solved(demos, task, config)
   ends = np.append(demos.first[1:], True)
   episode = 0

@@ -110,7 +110,7 @@ class Rig:
 
     task = make_task(task_name)
     self.board, self.clock = board, TurnedClock()
-    self._plant_board = plant_board
+    self.plant_board = plant_board
     self.plant = Plant(task.scene.model, seed=seed)
     self.simulation = Simulation(plant_board, self.plant, Scene(task, seed=seed))
     self.simulation.publish(self.now)
@@ -184,7 +184,7 @@ class Rig:
   @property
   def servo(self) -> Any:
     """The command to the arm: the record "servo"."""
-    return self._plant_board["servo"].read()
+    return self.plant_board["servo"].read()
 
   @property
   def reason(self) -> str:

@@ -56,7 +56,7 @@ class Rig(rigs.Rig):
   @property
   def objects_placed(self) -> int:
     """How often an operator has placed the objects."""
-    return int(self._plant_board["scene"].read()["number"])
+    return int(self.plant_board["scene"].read()["number"])
 
   def open_fingers(self) -> None:
     """Opens them without the control process."""

@@ -172,11 +172,22 @@ def test_the_log_has_the_measured_times(board, tmp_path):
   names = ["global", "wrist", "joints", "gripper", "action"]
   assert dataset.names["times"] == names
   times = dict(zip(names, dataset.episodes[0].columns["times"].T, strict=True))
-  grid = PERIOD * np.arange(10)
-  np.testing.assert_allclose(times["action"], grid + 0.005, atol=1e-5)
+  grid = PERIOD * np.arange(11)
+  np.testing.assert_allclose(times["action"][:-1], grid[:-1] + 0.005, atol=1e-5)
   np.testing.assert_allclose(times["wrist"], grid - 0.02, atol=1e-5)
   np.testing.assert_allclose(times["joints"], -0.002, atol=1e-5)
   np.testing.assert_allclose(times["gripper"], -0.02, atol=1e-5)
+
+
+def test_the_log_has_what_the_last_action_has_led_to(board, tmp_path):
+  with logging(tmp_path / "log", False) as recorder:
+    episode = Episode(board, recorder=recorder)
+    episode.play()
+  (kept,) = lerobot.read(tmp_path / "log").episodes
+  assert len(kept.actions) == episode.found["actions"] + 1
+  assert (kept.actions[:-1] == 0.25).all()
+  np.testing.assert_array_equal(kept.actions[-1], [0, 0, 0, 0, 0, 0, 0.25])
+  assert len(list(kept.images("observation.images.global"))) == len(kept.actions)
 
 
 def test_an_episode_without_instants_is_not_in_the_log(board, tmp_path):

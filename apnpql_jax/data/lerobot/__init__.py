@@ -10,6 +10,7 @@ from apnpql_jax.data.lerobot.layout import (
   IMAGES,
   STATE,
   SUCCESS,
+  TIMES,
   check_available,
   is_dataset,
 )
@@ -22,6 +23,7 @@ __all__ = [
   "IMAGES",
   "STATE",
   "SUCCESS",
+  "TIMES",
   "Dataset",
   "Episode",
   "Writer",

@@ -10,8 +10,8 @@ import numpy as np
 
 from apnpql_jax.data import demonstrations, real_arm
 from apnpql_jax.data.demonstrations import Demonstrations
-from apnpql_jax.data.lerobot.layout import ENVIRONMENT
-from apnpql_jax.data.lerobot.reader import Dataset, read
+from apnpql_jax.data.lerobot.layout import ENVIRONMENT, TIMES
+from apnpql_jax.data.lerobot.reader import Dataset, Episode, read
 from apnpql_jax.errors import FileError, UserError
 from apnpql_jax.sim.scene import ARM_JOINTS, GRIPPER_JOINT, Scene
 
@@ -27,12 +27,16 @@ def state_names(scene: Scene) -> list[str]:
   return [*_position_names(scene.model), *_velocity_names(scene.model), _VARIANT]
 
 
-def states(demos: Demonstrations) -> np.ndarray:
-  """Returns the states f32[n, k] of demonstrations, in the order of ``state_names``."""
-  mocap = np.concatenate([demos.mocap_pos, demos.mocap_quat], axis=-1)
-  mocap = mocap.reshape(demos.instants, -1)
-  variant = demos.variant[:, None].astype(np.float32)
-  parts = [demos.qpos, mocap, demos.qvel, variant]
+def states(
+  qpos: np.ndarray,
+  qvel: np.ndarray,
+  mocap_pos: np.ndarray,
+  mocap_quat: np.ndarray,
+  variant: np.ndarray,
+) -> np.ndarray:
+  """Returns n states f32[n, k] in the order of ``state_names``; see Demonstrations."""
+  mocap = np.concatenate([mocap_pos, mocap_quat], axis=-1).reshape(len(qpos), -1)
+  parts = [qpos, mocap, qvel, variant[:, None]]
   return np.concatenate(parts, axis=1).astype(np.float32)
 
 
@@ -40,8 +44,9 @@ def convert(folder: Path, scene: Scene, *, period_s: float) -> Demonstrations:
   """Reads a dataset as demonstrations.
 
   A dataset with whole states, as ``apnpql collect`` writes it, gives the demonstrations
-  that it was made from. One with poses only is converted like a recording, see
-  ``real_arm``.
+  that it was made from. So does the log of a simulated robot; where its policy was late
+  and dropped a period, a new episode begins. One with poses only is converted like a
+  recording, see ``real_arm``.
 
   Raises:
     FileError: The folder is no dataset, is damaged, holds no poses of the objects, or
@@ -76,7 +81,8 @@ def _exact(dataset: Dataset, scene: Scene, period_s: float) -> Demonstrations:
   qpos, mocap, qvel, variant = np.split(rows, ends, axis=1)
   mocap = mocap.reshape(len(rows), model.nmocap, 7)
   action = np.concatenate([x.actions for x in dataset.episodes])
-  first = np.concatenate([x.time == 0 for x in dataset.episodes])
+  times = [_times(dataset, x) for x in dataset.episodes]
+  first = np.concatenate([_begins(x, period_s) for x in times])
   demos = Demonstrations(
     qpos=qpos,
     qvel=qvel,
@@ -90,12 +96,32 @@ def _exact(dataset: Dataset, scene: Scene, period_s: float) -> Demonstrations:
   return demos
 
 
+def _times(dataset: Dataset, episode: Episode) -> np.ndarray:
+  """Returns the times of frames f64[n], s, in whole periods of the dataset.
+
+  A log has measured ones, which tell where a policy was late and dropped periods.
+  """
+  names = dataset.names.get(TIMES, [])
+  if "joints" not in names:
+    return episode.time
+  measured = episode.columns[TIMES][:, names.index("joints")]
+  return np.round((measured - measured[0]) * dataset.fps) / dataset.fps
+
+
+def _begins(times: np.ndarray, period_s: float) -> np.ndarray:
+  """Returns bool[n]: where instants begin that are one control period apart.
+
+  After a dropped period they are not: the arm has held, or followed an older action.
+  """
+  return np.append(True, abs(np.diff(times) / period_s - 1) > 0.5)
+
+
 def _from_poses(dataset: Dataset, scene: Scene, period_s: float) -> Demonstrations:
   """Returns demonstrations from joint angles and poses of objects."""
   bodies, joints = real_arm.tracked(scene)
   known = dataset.names[ENVIRONMENT]
   arrays = {
-    "time": np.concatenate([x.time for x in dataset.episodes]),
+    "time": np.concatenate([_times(dataset, x) for x in dataset.episodes]),
     "joints": np.concatenate([x.joints for x in dataset.episodes]),
     "gripper": np.concatenate([x.gripper for x in dataset.episodes]),
     "episode": np.repeat(
