@@ -33,7 +33,7 @@ def export(
   acting: str | None = None,
   overwrite: bool = False,
 ) -> dict[str, Any]:
-  """Writes the policy of a run to a folder that needs only JAX and NumPy.
+  """Writes the policy of a run to a folder that needs only JAX, flatbuffers and NumPy.
 
   The contract is written last: a folder without one is not complete.
 

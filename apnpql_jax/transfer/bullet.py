@@ -18,6 +18,9 @@ import numpy as np
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.transfer import urdf
 
+VERSION = 1
+"""Of the worlds in Bullet: raised by a change of their bodies, contacts or servos."""
+
 
 def require(option: str) -> None:
   """Raises ``ConfigError`` if PyBullet, which an option needs, is not installed."""

@@ -75,6 +75,7 @@ class Cell:
     about = {k: getattr(self, k) for k in ("physics", "renderer", "looks")}
     if self.physics == "bullet":
       about |= {"latency_ms": self._latency_ms, "admittance": self.admittance}
+      about["bullet_version"] = bullet.VERSION
     if self.looks == "unseen":
       about["looks_version"] = looks.VERSION
     if self.without:

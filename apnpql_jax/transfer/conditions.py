@@ -13,6 +13,7 @@ import zlib
 
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.runs import checkpoint_record
+from apnpql_jax.tasks import make_task
 from apnpql_jax.transfer.cell import Cell
 
 
@@ -21,8 +22,7 @@ def of_expert(
 ) -> dict[str, Any]:
   """Returns the conditions of episodes of the scripted expert."""
   return {
-    "task": config.task,
-    "env_crc32": _env_crc32(config),
+    **_of_worlds(config),
     **cell.about(),
     "algorithm": "expert",
     "episodes": episodes,
@@ -56,8 +56,7 @@ def of_run(
   """
   learner = checkpoint_record.read(run_dir, step).items.get("learner", {})
   return {
-    "task": config.env.task,
-    "env_crc32": _env_crc32(config.env),
+    **_of_worlds(config.env),
     **cell.about(),
     "algorithm": config.agent.algorithm,
     "trained": "randomized" if config.env.randomize else "plain",
@@ -69,11 +68,16 @@ def of_run(
   }
 
 
-def _env_crc32(config: EnvConfig) -> int:
-  """Returns a checksum of the settings that worlds and images depend on."""
+def _of_worlds(config: EnvConfig) -> dict[str, Any]:
+  """Returns task and scene, and a checksum of the settings of worlds and images."""
   # A cell chooses the physics, and a task may be read from any folder.
   fields = dataclasses.asdict(config)
-  return _crc32({k: x for k, x in fields.items() if k not in ("backend", "task_file")})
+  used = {k: x for k, x in fields.items() if k not in ("backend", "task_file")}
+  return {
+    "task": config.task,
+    "scene_sha256": make_task(config.task).scene.fingerprint,
+    "env_crc32": _crc32(used),
+  }
 
 
 def _crc32(value: Any) -> int:

@@ -12,15 +12,17 @@ import pixel_comparison
 import pytest
 import search
 import state_comparison
+import update_budget
 
 from apnpql_jax.agents.table_one import epsilon_bounds
 from apnpql_jax.config.checks import validate
 from apnpql_jax.config.files import config_diff
 
 COMPARISONS = [state_comparison.COMPARISON, pixel_comparison.COMPARISON]
+OTHERS = [search.COMPARISON, ablations.COMPARISON, update_budget.COMPARISON]
 RUNS = [
   (comparison, task, row)
-  for comparison in (*COMPARISONS, search.COMPARISON, ablations.COMPARISON)
+  for comparison in (*COMPARISONS, *OTHERS)
   for task, row in itertools.product(comparison.tasks, comparison.rows)
 ]
 
@@ -91,6 +93,39 @@ def test_each_ablation_changes_one_part(task: str):
     {"agent.primitive_gripper"},
     {"env.true_primitives"},
   ]
+
+
+@pytest.mark.parametrize("task", update_budget.COMPARISON.tasks)
+def test_runs_of_the_budget_make_as_many_updates_and_evaluations(task: str):
+  """Both levels of a factor meet both levels of each other one."""
+  comparison = update_budget.COMPARISON
+  configs = [comparison.config_of(task, row, 0) for row in update_budget.ROWS]
+  for config in configs:
+    iteration = config.env.worlds * config.rollout_length
+    updates = config.total_steps / iteration * config.updates_per_iteration
+    assert updates == update_budget.UPDATES[task]
+    assert config.total_steps == 16 * config.eval_every
+    assert config.eval_every % iteration == 0
+  for one, other in itertools.combinations(zip(*update_budget.DESIGN, strict=True), 2):
+    assert len({*zip(one, other, strict=True)}) == 4
+
+
+def test_an_effect_is_the_ratio_of_geometric_means():
+  found, factors = {}, {"candidates": 1.5, "batch": 2.0, "updates": 0.5}
+  for row, level in update_budget.ROWS.items():
+    minutes = 4.0
+    for name, factor in factors.items():
+      minutes *= factor ** update_budget.FACTORS[name].index(level[name])
+    config = update_budget.COMPARISON.config_of("push_plate", row, 0)
+    rows = [
+      {"step": 1, "time/wall_s": 30 * minutes, "eval/success_rate": 0.9},
+      {"step": 2, "time/wall_s": 60 * minutes, "eval/success_rate": 0.96},
+    ]
+    result = {"config": dataclasses.asdict(config), "versions": {}, "final": {}}
+    found["push_plate", row] = [result | {"evaluations": rows}]
+  text = update_budget.effects(["push_plate"], found)
+  assert "| push_plate | 1.50 | 2.00 | 0.50 |" in text
+  assert "| push_plate | 100 | 128 | 64 | 6.0 |" in text
 
 
 @by_folder

@@ -136,6 +136,17 @@ def test_latency_shifts_the_motion(latency_s, scene, plant):
   assert np.abs(found[shift:] - path[shift:]).max() > 5e-3
 
 
+@pytest.mark.parametrize(("latency_s", "expected"), [(0.03, 1.0), (0.06, 0.83)])
+def test_latency_limits_the_speed(latency_s, expected, scene):
+  """The virtual arm waits for the measured one, which is late (0.05 rad at most)."""
+  fast = np.array([0, 0, 0, 0, 0, 1.0])
+  with Plant(scene, latency_s=latency_s, admittance=False) as late:
+    begin(late)
+    for _ in range(14):
+      late.step(fast, 0.0, PERIOD_S)
+    assert late.bodies.state()[1][5] == pytest.approx(expected, abs=0.02)
+
+
 def follow(plant: Plant) -> np.ndarray:
   """Returns joint angles f64[time, 6] at every cycle of two periods."""
   path = []
