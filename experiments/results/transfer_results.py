@@ -14,6 +14,10 @@ from apnpql_jax.runs.metrics import wilson_interval
 HEAD = "run,task,trained,physics,renderer,looks,latency,admittance,solved,95%,failed in"
 """Columns of the table; trained: in plain or randomized worlds."""
 
+NAMES = {"native": "MuJoCo", "mjx": "MJX", "bullet": "Bullet"}
+NAMES |= {"opengl": "OpenGL", "tiny": "TinyRenderer", "trained": "randomized"}
+"""Options of the command in words, where they differ."""
+
 MALFORMED = (OSError, ValueError, LookupError, TypeError, AttributeError)
 """Exceptions that a damaged result causes."""
 
@@ -69,8 +73,10 @@ def together(found: list[dict[str, Any]]) -> str:
 
 
 def cell_label(found: dict[str, Any]) -> str:
-  """Returns the name of a result's cell."""
-  parts = [found["physics"], found["renderer"], looks_of(found)]
+  """Returns the name of a result's cell in words."""
+  parts = [NAMES.get(found[key], found[key]) for key in ("physics", "renderer")]
+  looks, missing = found["looks"], " and ".join(found.get("without", ()))
+  parts.append(NAMES.get(looks, looks) + (f" without {missing}" if missing else ""))
   if "latency_ms" in found:
     parts.append(f"{found['latency_ms']} ms")
   return listed([*parts, *["admittance"] * found.get("admittance", False)])
