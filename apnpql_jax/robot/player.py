@@ -152,18 +152,10 @@ class Player:
       )
       self._wait(begin + number * period)
 
-  def _record(
-    self,
-    begin: float,
-    now: float,
-    state: Any,
-    action: np.ndarray,
-    frames: Sequence[Frame],
-  ) -> None:
-    """Keeps an instant for the log, if there is one; see ``Recorder.add``."""
+  def _record(self, *instant: Any) -> None:
+    """Keeps an instant for the log, if there is one; arguments as ``Recorder.add``."""
     if self._recorder is not None:
-      environment = self._environment()
-      self._recorder.add(begin, now, state, action, frames, environment)
+      self._recorder.add(*instant, self._environment())
 
   def _is_over(self, state: Any) -> bool:
     playing = state["number"] == self._order and state["phase"] == Phase.PLAY

@@ -6,11 +6,11 @@
   python experiments/results/transfer_table.py expert:stack_box
 
 A cell is physics/renderer/looks and, with Bullet, the latency in ms and "admittance".
-Looks such as unseen-shadows are unseen ones without a part.
-`apnpql transfer` plays every cell of every run in a process of its own, and the result
-is stored as <folder>/<run>-<cell>.json. The same command again plays only what is
-missing. It refuses a stored result of another seed, checkpoint or setting. Then it
-writes two tables of all results in the folder: table.md has a row per result, and
+Looks such as unseen-shadows are unseen ones without a part. `apnpql transfer` plays
+every cell of every run in a process of its own, and the result is stored as
+<folder>/<run>-<cell>.json. The same command again plays only what is missing. It
+refuses a stored result of another seed, checkpoint, scene or setting. Then it writes
+two tables of all results in the folder: table.md has a row per result, and
 by_training.md a row per cell, with the seeds of each training together. Runs are
 distinguished by the names of their folders, which end with a hyphen and the seed.
 """

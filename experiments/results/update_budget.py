@@ -31,7 +31,7 @@ DESIGN = ((0, 0, 1), (1, 0, 0), (0, 1, 0), (1, 1, 1))
 """Levels of the factors by row."""
 
 UPDATES = {"push_plate": 5_120, "stack_box": 10_240}
-"""Updates of a run, of which 16 evaluations divide it."""
+"""Updates of a run, with an evaluation after each sixteenth of them."""
 
 
 def levels(row: tuple[int, ...]) -> dict[str, int]:
@@ -100,28 +100,21 @@ def effects(tasks: Sequence[str], found: Found) -> str:
     for row, level in ROWS.items():
       listed = tables.listed(times.get((task, row), "-"))
       shown.append([task, *map(str, level.values()), listed])
-    means = (mean_log(times, task, name) for name in FACTORS)
+    means = (
+      [mean_log(times, task, name, value) for value in FACTORS[name]]
+      for name in FACTORS
+    )
     ratios.append([task, *(f"{np.exp(high - low):.2f}" for low, high in means)])
   return f"{tables.markdown(shown)}\n\n{tables.markdown(ratios)}\n"
 
 
 def mean_log(
-  times: dict[tuple[str, str], list[Time]], task: str, factor: str
-) -> tuple[float, float]:
-  """Returns the mean logarithm of the minutes at both levels of a factor."""
-  low, high = (
-    np.mean(
-      [
-        np.log(time.minutes)
-        for row, level in ROWS.items()
-        for time in times.get((task, row), ())
-        if level[factor] == value
-      ]
-      or [np.nan]
-    )
-    for value in FACTORS[factor]
-  )
-  return float(low), float(high)
+  times: dict[tuple[str, str], list[Time]], task: str, factor: str, value: int
+) -> float:
+  """Returns the mean logarithm of the minutes at a level of a factor; NaN if none."""
+  rows = [row for row, level in ROWS.items() if level[factor] == value]
+  logs = [np.log(x.minutes) for row in rows for x in times.get((task, row), ())]
+  return float(np.mean(logs)) if logs else np.nan
 
 
 if __name__ == "__main__":
