@@ -61,38 +61,51 @@ class Dynamixel:
       DeviceError: The port cannot be opened, or the package is missing.
     """
     sdk = vendor("dynamixel_sdk", "dynamixel-sdk")
-    self._success, self._where, self._id = sdk.COMM_SUCCESS, port, device_id
+    self._success, self._damaged = sdk.COMM_SUCCESS, sdk.ERRNUM_CRC
+    self._where, self._id = port, device_id
     self._port, self._packets = sdk.PortHandler(port), sdk.PacketHandler(2.0)
     try:
       self._port.setBaudRate(baud)  # Opens the port.
     except Exception as error:  # Those of pyserial, and of termios.
-      number = getattr(error, "errno", None)
-      cause = os.strerror(number) if number else one_line(error)
-      raise DeviceError(f"could not open port {port}: {cause}") from None
+      raise DeviceError(f"could not open port {port}: {_cause(error)}") from None
 
   def read(self, address: int, size: int) -> bytes:
     """See ``Bus``."""
-    data, *_ = self._try(self._packets.readTxRx, address, size)
+    (data,) = self._try("read", self._packets.readTxRx, address, size)
+    if len(data) != size:
+      raise DeviceError(
+        f"{self._where}: it answers {len(data)} bytes of {size} at {address}"
+      )
     return bytes(data)
 
   def write(self, address: int, data: bytes) -> None:
     """See ``Bus``."""
-    *_, error = self._try(self._packets.writeTxRx, address, len(data), list(data))
-    if error & 0x7F:  # Bit 7 is for hardware errors, which are read separately.
-      reason = one_line(Exception(self._packets.getRxPacketError(error & 0x7F)))
-      raise DeviceError(f"{self._where}: it refuses to write {address}: {reason}")
+    self._try("write", self._packets.writeTxRx, address, len(data), list(data))
 
   def close(self) -> None:
     """See ``Bus``."""
     self._port.closePort()
 
-  def _try(self, call: Callable[..., tuple], *args: Any) -> tuple:
-    """Returns what a call of the SDK returns, (..., result, error); tries again."""
+  def _try(
+    self, verb: str, call: Callable[..., tuple], address: int, *args: Any
+  ) -> list[Any]:
+    """Returns what a call of the SDK returns before its result and error.
+
+    It tries again where either packet has been damaged on its way. If that is the
+    instruction, the gripper reports it in an answer without data, which is whole.
+    """
     for _ in range(ATTEMPTS):
-      answer = call(self._port, self._id, *args)
-      if answer[-2] == self._success:
-        return answer
-      self._port.clearPort()
+      try:
+        *found, result, error = call(self._port, self._id, address, *args)
+      except Exception as failure:  # Those of pyserial, and of termios.
+        raise DeviceError(f"{self._where}: {_cause(failure)}") from None
+      error &= 0x7F  # Bit 7 is for hardware errors, which are read separately.
+      if result != self._success or error == self._damaged:
+        continue
+      if error:
+        reason = one_line(Exception(self._packets.getRxPacketError(error)))
+        raise DeviceError(f"{self._where}: it refuses to {verb} {address}: {reason}")
+      return found
     raise Silent(f"{self._where}: {_SILENT}")
 
 
@@ -146,3 +159,9 @@ class Modbus:
           )
         return answer
     raise Silent(f"{self._where}: {_SILENT}")
+
+
+def _cause(error: Exception) -> str:
+  """Returns why a port fails, in words of the system if it gives a number."""
+  number = getattr(error, "errno", None)
+  return os.strerror(number) if number else one_line(error)

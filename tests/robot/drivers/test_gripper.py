@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 import contextlib
 import math
 import os
@@ -19,8 +19,9 @@ import pytest
 from apnpql_jax.config import files
 from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot import doubles
-from apnpql_jax.robot.doubles.dynamixel import FIRMWARE, crc
+from apnpql_jax.robot.doubles.dynamixel import FIRMWARE, Gripper, crc
 from apnpql_jax.robot.doubles.modbus import crc as modbus_crc
+from apnpql_jax.robot.doubles.plant import World
 from apnpql_jax.robot.doubles.server import ask
 from apnpql_jax.robot.drivers import buses, gripper as driver
 from apnpql_jax.robot.drivers.rh_p12_rn import (
@@ -306,45 +307,100 @@ def test_another_dynamixel_is_one_line():
     connect(port)
 
 
-@pytest.mark.parametrize("echo", [False, True])
-def test_a_port_without_a_gripper_is_one_line(echo):
+@contextlib.contextmanager
+def terminal(answer: Callable[[bytes], bytes]) -> Generator[tuple[str, int]]:
+  """A serial port behind which ``answer`` answers, and its descriptor."""
   ours, theirs = os.openpty()
   tty.setraw(theirs)
 
-  def answer() -> None:
+  def serve() -> None:
     with contextlib.suppress(OSError):
       while data := os.read(ours, 100):
-        if echo:
-          os.write(ours, data)
+        os.write(ours, answer(data))
 
-  threading.Thread(target=answer, daemon=True).start()
+  threading.Thread(target=serve, daemon=True).start()
+  yield os.ttyname(theirs), ours
+  os.close(theirs)
+
+
+@pytest.mark.parametrize("echo", [False, True])
+def test_a_port_without_a_gripper_is_one_line(echo):
   begin = time.monotonic()
-  with pytest.raises(DeviceError, match="nothing answers at /dev/pts") as error:
-    connect(os.ttyname(theirs))
+  with (
+    terminal(lambda data: data if echo else b"") as (port, _),
+    pytest.raises(DeviceError, match="nothing answers at /dev/pts") as error,
+  ):
+    connect(port)
   assert time.monotonic() - begin < 3
   assert "\n" not in str(error.value)
-  os.close(theirs)
+
+
+def test_a_packet_that_is_damaged_on_its_way_is_sent_again():
+  """The gripper answers a damaged instruction with an error and no data."""
+  table, damaged = TABLES[35074], []
+  double = Gripper(table, World("push_plate", noise=False))
+
+  def answer(data: bytes) -> bytes:
+    if damaged:
+      data = bytes([*data[:8], data[8] ^ damaged.pop(), *data[9:]])
+    return double.receive(data)
+
+  with terminal(answer) as (port, _):
+    line = buses.Dynamixel(port, driver.BAUD, 1)
+    for field in (table.torque_enable, table.current_limit, table.present_position):
+      damaged.append(1 << 4)
+      expected = double.load(field.address, field.size)
+      assert line.read(field.address, field.size) == expected
+      assert not damaged
+    goal = (300).to_bytes(4, "little")
+    damaged.append(1 << 4)
+    line.write(table.goal_position.address, goal)
+    line.close()
+  assert not damaged and double.load(table.goal_position.address, 4) == goal
+
+
+def test_a_refusal_or_an_answer_without_data_is_no_measurement():
+  access, nothing = 7, 0
+  double = Gripper(TABLES[35074], World("push_plate", noise=False))
+  errors = []
+  with terminal(lambda _: double._status(errors[-1])) as (port, _):
+    line = buses.Dynamixel(port, driver.BAUD, 1)
+    errors.append(access)
+    with pytest.raises(DeviceError, match="it refuses to read 580: .*not available"):
+      line.read(580, 4)
+    errors.append(nothing)
+    with pytest.raises(DeviceError, match="it answers 2 bytes of 4 at 580"):
+      line.read(580, 4)
+    line.close()
+
+
+def test_an_adapter_that_is_pulled_out_is_one_line():
+  double = Gripper(TABLES[35074], World("push_plate", noise=False))
+  with terminal(double.receive) as (port, descriptor):
+    line = buses.Dynamixel(port, driver.BAUD, 1)
+    assert line.read(0, 2) == (35074).to_bytes(2, "little")
+    os.close(descriptor)
+    with pytest.raises(DeviceError, match=port) as error:
+      line.read(0, 2)
+    with pytest.raises(DeviceError, match=port):
+      line.write(564, bytes(4))
+    line.close()
+  assert "\n" not in str(error.value)
 
 
 def test_a_refusal_by_modbus_closes_the_port():
   pytest.importorskip("pymodbus", reason="needs pymodbus")
-  ours, theirs = os.openpty()
-  tty.setraw(theirs)
-  port = os.ttyname(theirs)
-
-  def refuse() -> None:
-    with contextlib.suppress(OSError):
-      while data := os.read(ours, 100):
-        if data.startswith(b"\x01\x03"):  # Not a packet of Dynamixel.
-          os.write(ours, reply + modbus_crc(reply).to_bytes(2, "little"))
-
   reply = b"\x01\x83\x02"  # Illegal data address.
-  threading.Thread(target=refuse, daemon=True).start()
-  before = len(opened(port))
-  with pytest.raises(DeviceError, match="it refuses register 0") as error:
-    connect(port)
-  assert len(opened(port)) == before == 1, error  # Whose frames keep the bus.
-  os.close(theirs)
+  reply += modbus_crc(reply).to_bytes(2, "little")
+
+  def refuse(data: bytes) -> bytes:
+    return reply if data.startswith(b"\x01\x03") else b""  # Not of Dynamixel.
+
+  with terminal(refuse) as (port, _):
+    before = len(opened(port))
+    with pytest.raises(DeviceError, match="it refuses register 0") as error:
+      connect(port)
+    assert len(opened(port)) == before == 1, error  # Whose frames keep the bus.
 
 
 def opened(port: str) -> list[Path]:
