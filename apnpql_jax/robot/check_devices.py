@@ -82,7 +82,7 @@ def cameras(stack: Stack, table: Table, robot: Robot) -> Callable[[], Sequence[F
     cell = dataclasses.replace(robot.cell, calibration=None)
     robot = dataclasses.replace(robot, cell=cell)
   with table.row("cameras"):
-    opened = stack.enter_context(devices.open_cameras(robot))
+    opened, _ = stack.enter_context(devices.open_cameras(robot))
     for name, camera in zip(CAMERAS, opened, strict=True):
       view, shape = robot.contract["cameras"][name], _first_frame(camera).image.shape
       if shape != (view["height"], view["width"], 3):

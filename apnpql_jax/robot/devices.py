@@ -15,7 +15,7 @@ from typing import Any
 from apnpql_jax.errors import ConfigError, UserError, one_line
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
-from apnpql_jax.robot.protocols import Arm, Camera, Device, Gripper
+from apnpql_jax.robot.protocols import Arm, Camera, Device, Gripper, Judge
 from apnpql_jax.robot.supervisor import CAMERAS
 
 ROBOTS = ("ur5e", "simulated", "double")
@@ -95,13 +95,18 @@ def connected(device: Device) -> Generator[None]:
 
 
 @contextlib.contextmanager
-def open_cameras(robot: Robot) -> Generator[Sequence[Camera]]:
-  """Connects the cameras, in the order of ``supervisor.CAMERAS``; see ``open_arm``."""
+def open_cameras(robot: Robot) -> Generator[tuple[Sequence[Camera], Judge | None]]:
+  """Connects the cameras, in the order of ``supervisor.CAMERAS``; see ``open_arm``.
+
+  With them comes what judges their scene, if something can.
+  """
+  judge: Judge | None = None
   with contextlib.ExitStack() as stack:
     views = robot.contract["cameras"]
     if robot.kind == "simulated":
       rendered = importlib.import_module("apnpql_jax.robot.simulated_cameras")
-      cameras: Sequence[Camera] = rendered.make(robot.plant, robot.contract)
+      cameras: Sequence[Camera]
+      cameras, judge = rendered.make(robot.plant, robot.contract)
     elif robot.kind == "double":
       doubles = importlib.import_module("apnpql_jax.robot.doubles.cameras")
       eyes = doubles.cameras(
@@ -118,7 +123,7 @@ def open_cameras(robot: Robot) -> Generator[Sequence[Camera]]:
       ]
     for camera in cameras:
       stack.enter_context(connected(camera))
-    yield cameras
+    yield cameras, judge
 
 
 def calibrated_modes(robot: Robot) -> dict[str, Any]:

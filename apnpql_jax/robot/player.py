@@ -13,7 +13,7 @@ import numpy as np
 from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.board import Board, Phase
 from apnpql_jax.robot.devices import Robot
-from apnpql_jax.robot.protocols import Camera, Frame
+from apnpql_jax.robot.protocols import Camera, Frame, Judge
 from apnpql_jax.robot.recorder import Recorder
 
 HISTORY = 3
@@ -81,6 +81,8 @@ class Player:
     board: Board,
     cameras: Sequence[Camera],
     act: Act,
+    *,
+    judge: Judge | None = None,
     recorder: Recorder | None = None,
     ending: threading.Event | None = None,
   ):
@@ -89,17 +91,16 @@ class Player:
     Args:
       robot: The robot.
       board: The board.
-      cameras: The cameras, connected; the first has ``solved`` and ``environment`` if
-        the robot can judge.
+      cameras: The cameras, connected.
       act: The policy.
+      judge: What knows their scene, if something does.
       recorder: Gets each episode.
       ending: Ends the episode when it is set.
     """
     self.board, self._cameras, self._act = board, cameras, act
     self._contract, self._recorder = robot.contract, recorder
     self._clock, self._ending = robot.clock, ending or threading.Event()
-    self._judge = getattr(cameras[0], "solved", None)
-    self._environment = getattr(cameras[0], "environment", lambda: None)
+    self._judge = judge
     self._observer = Observer(robot.contract)
     self._order, self._solved, self._ended = 0, False, 0
 
@@ -135,7 +136,7 @@ class Player:
       state = self.board["state"].read()
       if self._is_over(state):
         return
-      self._solved = bool(self._judge and actions and self._judge())
+      self._solved = bool(self._judge and actions and self._judge.solved())
       if self._solved or number >= most:  # What the last action has led to.
         rest = np.append(np.zeros(6), action[6])
         self._record(begin, self._clock.now(), state, rest, frames)
@@ -155,7 +156,8 @@ class Player:
   def _record(self, *instant: Any) -> None:
     """Keeps an instant for the log, if there is one; arguments as ``Recorder.add``."""
     if self._recorder is not None:
-      self._recorder.add(*instant, self._environment())
+      known = None if self._judge is None else self._judge.environment()
+      self._recorder.add(*instant, known)
 
   def _is_over(self, state: Any) -> bool:
     playing = state["number"] == self._order and state["phase"] == Phase.PLAY

@@ -116,21 +116,23 @@ def main(robot: Robot, board_name: str, options: dict[str, Any], peer: Pipe) -> 
       recorded = recorded_actions(Path(options["replay"]), folder.contract)
       act = replaying(recorded)
     with contextlib.ExitStack() as stack:
-      cameras = stack.enter_context(devices.open_cameras(robot))
+      cameras, judge = stack.enter_context(devices.open_cameras(robot))
       recorder = None
       if options["log"] is not None:
         recorder = stack.enter_context(
           Recorder(
             Path(options["log"]),
             folder.contract,
-            judged=robot.can_judge,
-            environment=getattr(cameras[0], "environment_names", tuple)(),
+            judged=judge is not None,
+            environment=() if judge is None else judge.environment_names(),
             devices=_described(robot, board, cameras),
           )
         )
       for camera in cameras:  # The first frame may take long.
         camera.get_observation()
-      player = Player(robot, board, cameras, act, recorder, ending)
+      player = Player(
+        robot, board, cameras, act, judge=judge, recorder=recorder, ending=ending
+      )
       stack.callback(player.end_episode)
       board["policy"].write({"ready": 1})
       ready.set()

@@ -123,3 +123,19 @@ class Camera(Device, Protocol):
   def get_observation(self) -> Frame:
     """Returns the newest frame without waiting."""
     ...
+
+
+class Judge(Protocol):
+  """What knows the whole scene; no sensor of a real arm does."""
+
+  def solved(self) -> bool:
+    """Returns whether the task was solved at the newest frames."""
+    ...
+
+  def environment(self) -> np.ndarray:
+    """Returns the state of the scene that the newest frames show, f32[k]."""
+    ...
+
+  def environment_names(self) -> list[str]:
+    """Returns the names of the numbers in ``environment``."""
+    ...

@@ -27,7 +27,10 @@ from apnpql_jax.tasks import make_task
 
 
 class View:
-  """The task's scene as the plant has it, drawn and judged in JAX."""
+  """The task's scene as the plant has it, drawn and judged in JAX.
+
+  See ``protocols.Judge``.
+  """
 
   def __init__(self, plant: str, contract: dict[str, Any]):
     """Compiles the cameras of the contract."""
@@ -49,8 +52,7 @@ class View:
     self._draw = draw
     self._board = Board(plant, RECORDS)
     self.frames: list[Frame] = []
-    self.solved = False
-    self.environment = np.zeros(0, np.float32)
+    self._solved, self._environment = False, np.zeros(0, np.float32)
 
   def look(self) -> None:
     """Draws both cameras, judges whether the task is solved, and keeps the state."""
@@ -59,10 +61,22 @@ class View:
     *images, solved = jax.device_get(self._draw(state))
     arrays = state.qpos, state.qvel, state.mocap_pos, state.mocap_quat
     variant = np.array([found["variant"]])
-    (self.environment,) = conversion.states(*map(np.asarray, arrays), variant)
+    (self._environment,) = conversion.states(*map(np.asarray, arrays), variant)
     time = float(found["time"])
     self.frames = [Frame(time, np.asarray(image)) for image in images]
-    self.solved = bool(solved)
+    self._solved = bool(solved)
+
+  def solved(self) -> bool:
+    """See ``Judge.solved``."""
+    return self._solved
+
+  def environment(self) -> np.ndarray:
+    """See ``Judge.environment``."""
+    return self._environment
+
+  def environment_names(self) -> list[str]:
+    """See ``Judge.environment_names``."""
+    return conversion.state_names(self.task.scene)
 
   def close(self) -> None:
     """Lets go of the plant."""
@@ -111,20 +125,8 @@ class SimulatedCamera:
       self._view.look()
     return self._view.frames[self._index]
 
-  def solved(self) -> bool:
-    """Returns whether the task was solved at the newest frame."""
-    return self._view.solved
 
-  def environment_names(self) -> list[str]:
-    """Returns the names of the numbers in ``environment``."""
-    return conversion.state_names(self._view.task.scene)
-
-  def environment(self) -> np.ndarray:
-    """Returns the state of the scene that the newest frame shows, f32[k]."""
-    return self._view.environment
-
-
-def make(plant: str, contract: dict[str, Any]) -> list[SimulatedCamera]:
-  """Returns the cameras in the order of ``CAMERAS``."""
+def make(plant: str, contract: dict[str, Any]) -> tuple[list[SimulatedCamera], View]:
+  """Returns the cameras in the order of ``CAMERAS``, and what judges their scene."""
   view = View(plant, contract)
-  return [SimulatedCamera(view, index) for index in range(len(CAMERAS))]
+  return [SimulatedCamera(view, index) for index in range(len(CAMERAS))], view

@@ -121,7 +121,7 @@ def bench(exported, monkeypatch) -> Bench:
   monkeypatch.setattr(devices, "make_arm", lambda robot, reads: found.arm)
   monkeypatch.setattr(devices, "make_gripper", lambda robot: found.gripper)
   monkeypatch.setattr(
-    devices, "open_cameras", lambda robot: contextlib.nullcontext(found.cameras)
+    devices, "open_cameras", lambda robot: contextlib.nullcontext((found.cameras, None))
   )
   load = policy_process.load_program
   monkeypatch.setattr(

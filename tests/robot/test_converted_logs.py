@@ -73,12 +73,19 @@ class Session:
     self.rig, self.seen = rig, []
     plant = rig.plant_board
     robot = Robot("simulated", CONTRACT, Cell(), RigClock(rig=rig), plant.name)
-    self._cameras = simulated_cameras.make(plant.name, CONTRACT)
+    self._cameras, judge = simulated_cameras.make(plant.name, CONTRACT)
     self._operator = simulated.Operator(plant, self._until)
     self._rng = np.random.default_rng(0)
-    names = self._cameras[0].environment_names()
+    names = judge.environment_names()
     self._recorder = Recorder(folder, CONTRACT, judged=True, environment=names)
-    self._player = Player(robot, rig.board, self._cameras, self._act, self._recorder)
+    self._player = Player(
+      robot,
+      rig.board,
+      self._cameras,
+      self._act,
+      judge=judge,
+      recorder=self._recorder,
+    )
 
   def play(self, episode: int) -> None:
     rig = self.rig

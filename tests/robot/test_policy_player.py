@@ -50,11 +50,14 @@ class Camera:
     return Frame(self._clock.now() - 0.02, np.full((24, 32, 3), 90, np.uint8))
 
 
-class Judge(Camera):
-  """A camera that can tell, as the simulated ones."""
+class Judge:
+  """A judge of a scene without a state."""
 
   def solved(self) -> bool:
     return False
+
+  def environment(self) -> None:
+    return None
 
 
 class Episode:
@@ -67,7 +70,7 @@ class Episode:
     *,
     frames: int = 1000,
     recorder: Recorder | None = None,
-    kind: type[Camera] = Camera,
+    judge: Any = None,
   ):
     """``thinks``: time in s that the policy takes for an action, by its number."""
     self.board, self.clock, self.times = board, TurnedClock(), []
@@ -78,8 +81,8 @@ class Episode:
       return np.full(7, 0.25, np.float32)
 
     robot = Robot("double", CONTRACT, Cell(), self.clock)
-    cameras: Any = [kind(self.clock, 1000), Camera(self.clock, frames)]
-    self.player = Player(robot, board, cameras, act, recorder)
+    cameras: Any = [Camera(self.clock, 1000), Camera(self.clock, frames)]
+    self.player = Player(robot, board, cameras, act, judge=judge, recorder=recorder)
     state = {"number": 1, "phase": Phase.PLAY, "time": START - 0.002}
     board["order"].write({"number": 1, "phase": Phase.PLAY})
     state["gripper_time"] = START - 0.02
@@ -155,14 +158,14 @@ def test_an_interrupted_episode_is_in_the_log(board, tmp_path):
   assert not list((tmp_path / "log").rglob("*.part*"))
 
 
-@pytest.mark.parametrize(("kind", "success"), [(Camera, None), (Judge, False)])
-def test_only_a_robot_that_can_judge_labels_success(board, tmp_path, kind, success):
-  with logging(tmp_path / "log", kind is Judge) as recorder:
-    Episode(board, recorder=recorder, kind=kind).play()
+@pytest.mark.parametrize(("judge", "success"), [(None, None), (Judge(), False)])
+def test_only_a_robot_that_can_judge_labels_success(board, tmp_path, judge, success):
+  with logging(tmp_path / "log", judge is not None) as recorder:
+    Episode(board, recorder=recorder, judge=judge).play()
   dataset = lerobot.read(tmp_path / "log")
   assert dataset.episodes[0].success is success
   info = (tmp_path / "log" / "meta" / "info.json").read_text()
-  assert ("next.success" in info) == (kind is Judge)
+  assert ("next.success" in info) == (judge is not None)
 
 
 def test_the_log_has_the_measured_times(board, tmp_path):
