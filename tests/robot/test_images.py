@@ -62,10 +62,8 @@ def state() -> dict:
 def drawn(state: dict, fovy: float, size: list[int]) -> np.ndarray:
   """Returns the global camera's image with a field of view, u8[H, W, 3]."""
   painter = renderer.Renderer("push_plate", {"global": fovy}, size)
-  try:
+  with painter.view:
     return painter.draw(state)[0]
-  finally:
-    painter.close()
 
 
 def test_a_wide_image_becomes_the_rendering_with_the_narrow_field_of_view(state):
