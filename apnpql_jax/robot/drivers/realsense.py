@@ -93,14 +93,11 @@ class RealSense:
       self.disconnect()
       raise DeviceError(f"camera {self._serial}: {one_line(error)}") from None
     self._native = self._frame = None
-    end = time.monotonic() + _FIRST_FRAME
-    while not self._poll():
-      if time.monotonic() > end:
-        self.disconnect()
-        raise DeviceError(
-          f"camera {self._serial}: no frame within {_FIRST_FRAME:g} s: check its cable"
-        )
-      time.sleep(0.005)
+    try:
+      self._wait_for_first()
+    except DeviceError:
+      self.disconnect()
+      raise
 
   def disconnect(self) -> None:
     """See ``protocols.Device``."""
@@ -198,8 +195,27 @@ class RealSense:
     }
     return images.opencv_lens(lens, inner.model.name, inner.coeffs)
 
+  def _wait_for_first(self) -> None:
+    end = time.monotonic() + _FIRST_FRAME
+    while not self._poll():
+      if time.monotonic() > end:
+        raise DeviceError(
+          f"camera {self._serial}: no frame within {_FIRST_FRAME:g} s: check its cable"
+        )
+      time.sleep(0.005)
+
   def _poll(self) -> bool:
-    """Takes the newest frame of the queue; returns whether there is a newer one."""
+    """Takes the newest frame of the queue; returns whether there is a newer one.
+
+    Raises:
+      DeviceError: The library fails.
+    """
+    try:
+      return self._take()
+    except RuntimeError as error:  # Those of librealsense.
+      raise DeviceError(f"camera {self._serial}: {one_line(error)}") from None
+
+  def _take(self) -> bool:
     new = False
     while frame := self._queue.poll_for_frame():
       when = self._captured(frame)

@@ -101,6 +101,22 @@ def test_an_unplugged_camera_is_one_line_in_time():
     assert "\n" not in str(error.value)
 
 
+class FailingQueue:
+  """The queue of a stream that fails."""
+
+  def poll_for_frame(self) -> None:
+    raise RuntimeError("hwmon command failed\nat usb")
+
+
+def test_a_failure_of_the_library_is_one_line():
+  with connected() as (_, camera):
+    camera._queue = FailingQueue()
+    for read in (camera.get_native, camera.get_observation):
+      with pytest.raises(DeviceError, match="camera double-wrist: hwmon") as error:
+        read()
+      assert "\n" not in str(error.value)
+
+
 def test_the_lens_is_that_of_the_camera_or_the_given_one():
   with connected() as (double, camera):
     lens = camera.lens()
