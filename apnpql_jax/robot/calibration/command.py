@@ -88,16 +88,17 @@ def calibrate(
   check_writable(out.absolute().parent)
   if out.exists() and not overwrite:
     raise FileError(f"{out} exists; replace it with --overwrite, or name another file")
-  earlier = files.read(out) if out.exists() else None
   if cameras:
     if arm is None:
       raise ConfigError("cameras without an arm give no views")
+    for name, camera in cameras.items():  # All of them, before the first view.
+      views.check_new(folder / name, camera)
     for name, camera in cameras.items():
       views.record(folder / name, kind, arm, camera, ask=ask)
   found = _calibrate_each(contract, folder, kind, board_on, serials)
+  kept = _kept(contract, out, found)
   pictures = [_picture(contract, name, x, out) for name, x in found.items()]
   checked = {name: _checked(contract, name, x.camera) for name, x in found.items()}
-  kept = {} if earlier is None else dict(earlier.cameras)
   files.save(
     out,
     Calibration(
@@ -128,6 +129,18 @@ def _names(contract: Json, folder: Path) -> list[str]:
     wanted = " or ".join(str(folder / name) for name in known)
     raise FileError(f"there are no views in {wanted}")
   return names
+
+
+def _kept(
+  contract: Json, out: Path, found: Mapping[str, _Found]
+) -> dict[str, CalibratedCamera]:
+  """Returns the cameras of an earlier calibration, if some have no new views.
+
+  Else the file may as well be damaged.
+  """
+  if not out.exists() or contract["cameras"].keys() <= found.keys():
+    return {}
+  return dict(files.read(out).cameras)
 
 
 def _calibrate_each(

@@ -115,6 +115,19 @@ def _camera(folder: Path) -> tuple[str, Lens | None]:
     ) from None
 
 
+def check_new(folder: Path, camera: Any) -> None:
+  """Checks that new views can be taken, see ``record``.
+
+  Raises:
+    ConfigError: The camera is simulated.
+    FileError: The folder exists.
+  """
+  if not hasattr(camera, "get_native"):
+    raise ConfigError(f"the {folder.name} camera gives no images of its sensor")
+  if folder.exists():
+    raise FileError(f"{folder} exists; name another folder for new views")
+
+
 def record(
   folder: Path,
   board: Board,
@@ -136,16 +149,12 @@ def record(
       Without a view, no folder is made.
 
   Raises:
-    ConfigError: The camera is simulated.
     DeviceError: A device fails.
-    FileError: The folder exists, or cannot be written.
+    UserError: See ``check_new``; or the folder cannot be written.
   """
   from PIL import Image
 
-  if not hasattr(camera, "get_native"):
-    raise ConfigError(f"the {folder.name} camera gives no images of its sensor")
-  if folder.exists():
-    raise FileError(f"{folder} exists; name another folder for new views")
+  check_new(folder, camera)
   about = {"serial": str(camera.describe()["serial_number"]), "lens": camera.lens()}
   count = 0
   while True:

@@ -421,6 +421,17 @@ def test_an_earlier_calibration_is_kept_or_completed(
   assert_close(loaded.cameras["wrist"].pose, wrist.truth)
 
 
+def test_a_damaged_calibration_is_replaced_by_one_of_all_cameras(
+  contract, both, written, held
+):
+  written.write_text("{")
+  command.calibrate(contract, both, written, overwrite=True)
+  assert_close(files.load(written, contract).cameras["global"].pose, held.truth)
+  written.write_text("{")
+  with pytest.raises(FileError, match="is damaged"):
+    command.calibrate(contract, _only(both, "wrist"), written, overwrite=True)
+
+
 def test_the_command_calibrates_a_cell(contract, both, tmp_path, held):
   """Without devices; the lens that is the maker's is not that of another mode."""
   out = tmp_path / "calibration.json"
@@ -492,6 +503,21 @@ class Sensor:
     black = np.zeros_like(self.images[0])
     image = black if self.showing is None else self.images[self.showing]
     return Frame(self.clock.now, image)
+
+
+def test_a_used_folder_is_found_before_the_first_view(contract, tmp_path):
+  sensor, asked = Sensor([], {}), []
+  (tmp_path / "views" / "global").mkdir(parents=True)
+  with pytest.raises(FileError, match="global exists; name another folder"):
+    command.calibrate(
+      contract,
+      tmp_path / "views",
+      tmp_path / "calibration.json",
+      arm=Hand(np.zeros((1, 6)), sensor),  # ty: ignore[invalid-argument-type]
+      cameras=dict.fromkeys(("wrist", "global"), sensor),  # ty: ignore[invalid-argument-type]
+      ask=lambda text: asked.append(text) or "d",
+    )
+  assert not asked
 
 
 def test_views_are_taken_with_connected_devices(
