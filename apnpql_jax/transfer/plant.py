@@ -21,7 +21,7 @@ from apnpql_jax.robot.virtual_arm import Admittance, VirtualArm
 from apnpql_jax.sim import motors
 from apnpql_jax.sim.physics import OWN_FIELDS
 from apnpql_jax.sim.scene import Scene
-from apnpql_jax.transfer import bullet, contacts
+from apnpql_jax.transfer import bullet, contacts, urdf
 
 SOLVER_ITERATIONS = 300
 """Iterations of Bullet's solver, which makes a step of 2 ms per command of the servos.
@@ -67,7 +67,11 @@ class Plant:
       scene: The scene of a task.
       latency_s: Time from the virtual arm to the servos, s.
       admittance: Whether the virtual arm yields to the wrench at the tool.
+
+    Raises:
+      ConfigError: Bullet cannot simulate the scene, see ``urdf.check``.
     """
+    urdf.check(scene)
     self.scene = scene
     self._client = bullet.connect()
     self._delay = round(latency_s / TIMESTEP)

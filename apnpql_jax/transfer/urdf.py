@@ -12,8 +12,31 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from apnpql_jax.errors import ConfigError
+from apnpql_jax.sim.scene import Scene
+
+KINDS = "plane", "sphere", "box", "capsule", "cylinder"
+"""Types of geoms."""
+
 PLANE = np.array([2.0, 2.0, 0.05])
 """Half sizes of the box whose upper side stands for a plane, m."""
+
+
+def check(scene: Scene) -> None:
+  """Checks that a scene can be simulated: joints are the robot's, or free.
+
+  Raises:
+    ConfigError: Another body has a joint, or there is a geom of another type.
+  """
+  model = scene.model
+  tree, free = model.body_rootid[model.jnt_bodyid], mujoco.mjtJoint.mjJNT_FREE
+  others = (tree != tree[model.actuator_trnid[0, 0]]) & (model.jnt_type != free)
+  found = [f"the joint {model.joint(i).name}" for i in np.flatnonzero(others)]
+  kinds = sorted({_kind(model, geom) for geom in range(model.ngeom)} - {*KINDS})
+  found += [f"geoms of the type {kind}" for kind in kinds]
+  if found:
+    what = " and ".join(found)
+    raise ConfigError(f"{scene.name}.xml has {what}, which --physics bullet lacks")
 
 
 def roots(model: mujoco.MjModel) -> list[int]:
@@ -27,7 +50,7 @@ def write(model: mujoco.MjModel, root: int) -> str:
   Links are named "body_<id>" and joints "joint_<id>", by the ids of MuJoCo.
 
   Raises:
-    ValueError: URDF cannot express a joint or a shape.
+    ValueError: URDF cannot express a joint or a shape; see ``check``.
   """
   bodies = [root]
   for body in range(root + 1, model.nbody if root else 0):
@@ -62,8 +85,13 @@ def _shapes(model: mujoco.MjModel, body: int) -> Iterator[str]:
       yield f"<collision>{shape}</collision>"
 
 
+def _kind(model: mujoco.MjModel, geom: int) -> str:
+  name = mujoco.mjtGeom(model.geom_type[geom]).name
+  return name.removeprefix("mjGEOM_").lower()
+
+
 def _shape(model: mujoco.MjModel, geom: int) -> str:
-  kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
+  kind = _kind(model, geom)
   size, pos = model.geom_size[geom], model.geom_pos[geom]
   if kind == "plane":
     kind, size, pos = "box", PLANE, pos - PLANE * [0, 0, 1]

@@ -11,6 +11,7 @@ import numpy as np
 
 from apnpql_jax.envs.env import Env
 from apnpql_jax.envs.state import Arrival, EnvState
+from apnpql_jax.transfer import urdf
 from apnpql_jax.transfer.plant import Plant
 from apnpql_jax.types import Array
 
@@ -19,7 +20,12 @@ class Worlds:
   """A plant per world, for the loop of ``play``."""
 
   def __init__(self, env: Env, *, latency_s: float, admittance: bool):
-    """Keeps the settings; simulators are opened when they are needed."""
+    """Keeps the settings; simulators are opened when they are needed.
+
+    Raises:
+      ConfigError: Bullet cannot simulate the scene, see ``urdf.check``.
+    """
+    urdf.check(env.task.scene)  # Before anything is compiled.
     self._stack = contextlib.ExitStack()
     self._env = env
     self._options: dict[str, Any] = {"latency_s": latency_s, "admittance": admittance}

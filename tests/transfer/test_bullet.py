@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import sys
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 
+from apnpql_jax.config.files import mjcf_path
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.virtual_arm import VirtualArm
 from apnpql_jax.sim import motors
-from apnpql_jax.sim.scene import Scene
+from apnpql_jax.sim.scene import Scene, load_scene
 from apnpql_jax.tasks import make_task, task_names
 from apnpql_jax.tasks.pinch import finger_angle, pinch_height
 from apnpql_jax.tasks.stack_box import SIDE
@@ -35,6 +38,45 @@ def plant(scene: Scene) -> Iterator[Plant]:
   pytest.importorskip("pybullet")
   with Plant(scene, latency_s=0.0, admittance=False) as plant:
     yield plant
+
+
+CHAIN = """
+<body name="lid" pos="0.7 0 0.3"><freejoint/><geom type="box" size="0.1 0.1 0.01"/>
+  <body name="knob"><joint name="turn" type="hinge" axis="0 0 1"/>
+    <geom type="sphere" size="0.02" pos="0 0 0.03"/></body></body>"""
+DRAWER = """
+<body name="drawer" pos="0.7 0 0.2"><joint name="pull" type="slide" axis="1 0 0"/>
+  <geom type="box" size="0.1 0.1 0.03"/></body>"""
+CONE = """
+<geom name="cone" type="mesh" mesh="cone" pos="0.8 0.3 0.2"/></worldbody>
+<asset><mesh name="cone" vertex="0 0 0 0.1 0 0 0 0.1 0 0 0 0.1"/></asset><worldbody>"""
+EGG = """
+<geom name="egg" type="ellipsoid" size="0.02 0.03 0.04" pos="0.8 0.3 0.2"/>"""
+
+
+@pytest.mark.parametrize(
+  ("things", "words"),
+  [
+    (DRAWER, "the joint pull"),
+    (CHAIN, "the joint turn"),
+    (CONE, "geoms of the type mesh"),
+    (DRAWER + EGG, "the joint pull and geoms of the type ellipsoid"),
+  ],
+)
+def test_a_scene_that_bullet_lacks_is_refused(things, words, tmp_path):
+  pytest.importorskip("pybullet")
+  path = tmp_path / "kitchen.xml"
+  path.write_text(
+    f"""<mujoco><include file="{mjcf_path("arena")}"/><worldbody>{things}</worldbody>
+      </mujoco>"""
+  )
+  scene = load_scene(path)
+  refusal = f"kitchen.xml has {words}, which --physics bullet lacks"
+  with pytest.raises(ConfigError, match=f"^{refusal}$"):
+    Plant(scene, latency_s=0.0, admittance=False)
+  env: Any = SimpleNamespace(task=SimpleNamespace(scene=scene))
+  with pytest.raises(ConfigError, match=f"^{refusal}$"):
+    Cell(physics="bullet").make_worlds(env)
 
 
 def begin(plant: Plant, *, closed: bool = False, **fields: np.ndarray) -> np.ndarray:
