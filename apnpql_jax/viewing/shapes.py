@@ -6,10 +6,11 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 from apnpql_jax.envs.cameras import in_hand
 from apnpql_jax.render import Geoms
+from apnpql_jax.render.hull import THIN
 from apnpql_jax.sim.scene import Scene
 
 _KIND = mujoco.mjtGeom
@@ -20,7 +21,8 @@ _TURNS, _RINGS = 20, 6
 def surface(kind: int, size: np.ndarray) -> np.ndarray:
   """Returns points f64[n, 3] (m) whose convex hull is a geom, in its frame.
 
-  ``kind`` and ``size`` are MuJoCo's; a plane has no such points.
+  ``kind`` and ``size`` are MuJoCo's; a plane has no such points, and those of a mesh
+  are its ``corners``.
   """
   x, y, z = (float(value) for value in size)
   if kind == _KIND.mjGEOM_BOX:
@@ -38,6 +40,19 @@ def surface(kind: int, size: np.ndarray) -> np.ndarray:
     shift = np.array([0.0, 0.0, y])
     return np.concatenate([ball * x - shift, ball * x + shift])
   raise ValueError(f"a geom of kind {kind} has no convex hull")
+
+
+def corners(planes: np.ndarray, size: np.ndarray) -> np.ndarray:
+  """Returns the corners f64[n, 3] (m) of a mesh's hull as images have it.
+
+  Args:
+    planes: Planes f32[k, 4] in sizes, see ``render.hull``; the origin, which is the
+      center of mass, is inside.
+    size: Sizes of the geom f[3], m.
+  """
+  halfspaces = planes.astype(np.float64) * [1, 1, 1, -1]
+  inside = HalfspaceIntersection(halfspaces, np.zeros(3))
+  return inside.intersections * np.maximum(size, THIN)
 
 
 def mesh(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -72,8 +72,8 @@ class Stage:
     """Adds all nodes; those of the same name are replaced."""
     drawn = self._drawn
     self._geoms = [
-      self._add(f"/scene/{i}", int(kind), sizes[i], tuple(color))
-      for i, kind, color in zip(drawn.ids, drawn.types, colors.tolist(), strict=True)
+      self._add(row, sizes[i], tuple(color))
+      for row, (i, color) in enumerate(zip(drawn.ids, colors.tolist(), strict=True))
     ]
     parts = shapes.GhostHand(self._scene, sizes).parts(frame.poses)
     vertices, faces = _joined([shapes.mesh(part) for part in parts])
@@ -96,9 +96,11 @@ class Stage:
       )
       self._ghosts.append((ghost, way, label))
 
-  def _add(self, name: str, kind: int, size: np.ndarray, color: Any) -> Any:
+  def _add(self, row: int, size: np.ndarray, color: Any) -> Any:
+    """Adds a row of ``Geoms``."""
+    drawn, add = self._drawn, self._nodes
+    name, kind = f"/scene/{drawn.ids[row]}", int(drawn.types[row])
     x, y, z = size.tolist()
-    add = self._nodes
     if kind == _KIND.mjGEOM_PLANE:
       vertices = (
         0.5 * _PLANE * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
@@ -111,9 +113,11 @@ class Stage:
       return add.add_cylinder(name, radius=x, height=2 * y, color=color)
     if kind == _KIND.mjGEOM_SPHERE:
       return add.add_icosphere(name, radius=x, color=color)
-    return add.add_mesh_simple(
-      name, *shapes.mesh(shapes.surface(kind, size)), color=color
-    )
+    if kind == _KIND.mjGEOM_MESH:
+      points = shapes.corners(drawn.hulls[row], size)
+    else:
+      points = shapes.surface(kind, size)
+    return add.add_mesh_simple(name, *shapes.mesh(points), color=color)
 
 
 def _quaternions(mats: np.ndarray) -> np.ndarray:
