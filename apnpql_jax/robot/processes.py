@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 import contextlib
 from multiprocessing import get_context
+import os
 from typing import Any
 
 from apnpql_jax.robot import control_process, policy_process
@@ -44,9 +45,9 @@ class Processes:
     """Returns whether a process runs."""
     return self._running[name].is_alive()
 
-  def kill(self, name: str) -> None:
-    """Ends a process at once."""
-    self._running[name].kill()
+  def send_signal(self, name: str, number: int) -> None:
+    """Sends a signal to a process."""
+    os.kill(self._running[name].pid, number)
 
   def join(self, name: str, seconds: float) -> None:
     """Waits for the end of a process."""

@@ -28,6 +28,9 @@ START_S = 600.0
 HOME_S = 60.0
 """Longest time of a motion to the neutral pose, or of an operator's help, s."""
 
+REST_S = 10.0
+"""Time that the arm may take to come to rest, s."""
+
 UNKNOWN = "the arm's controller holds; its state is unknown"
 
 
@@ -163,7 +166,7 @@ class Session(contextlib.AbstractContextManager):
     """Brings the arm to rest and ends the processes; ``rest`` is what came of it."""
     if self.processes is not None:
       self._orders.give(Phase.QUIT)
-      self.processes.join("control", 10.0 * self._clock.slowdown)
+      self.processes.join("control", REST_S * self._clock.slowdown)
       if self._moved:
         known = not self.processes.is_alive("control")
         at_rest = known and self.board["state"].read()["at_rest"]
@@ -251,7 +254,7 @@ class Session(contextlib.AbstractContextManager):
     self._orders.give(Phase.IDLE)
     if not comes_true(
       lambda: self._orders.obeyed or not self._running.is_alive("control"),
-      10.0 * self._clock.slowdown,
+      REST_S * self._clock.slowdown,
     ):
       self._failure = self._failure or "robot: the arm does not come to rest"
 

@@ -11,6 +11,7 @@ import contextlib
 import functools
 from multiprocessing import get_context
 from pathlib import Path
+import resource
 import threading
 from typing import Any
 from unittest import mock
@@ -53,25 +54,42 @@ class Camera:
     return Frame(self._clock.now(), self._image)
 
 
-def policy(folder: Path, board_name: str, peer: Any, clock: Clock) -> None:
+class FullDisk(Recorder):
+  """A log that the system refuses to write any more when an episode ends."""
+
+  def end_episode(self, success: bool | None) -> int | None:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
+    return super().end_episode(success)
+
+
+def policy(
+  folder: Path,
+  log: str,
+  frames: int,
+  recorder: type[Recorder],
+  board_name: str,
+  peer: Any,
+  clock: Clock,
+) -> None:
   """Runs the policy process with such cameras."""
   contract = policy_folder.load(folder / "policy").contract
 
   @contextlib.contextmanager
-  def cameras(robot: Robot) -> Generator[list[Camera]]:
-    views = robot.contract["cameras"]
-    yield [
-      Camera(clock, views[x], 1 + FRAMES) for x in CAMERAS
-    ]  # One before the first.
+  def cameras(robot: Robot) -> Generator[tuple[list[Camera], None]]:
+    views, most = robot.contract["cameras"], 1 + frames  # One before the first.
+    yield [Camera(clock, views[x], most) for x in CAMERAS], None
 
   options = {
     "policy": str(folder / "policy"),
     "seed": 0,
-    "log": str(folder / "log"),
+    "log": str(folder / log),
     "replay": str(folder / "recorded"),
   }
   robot = Robot("double", contract, Cell(), clock)
-  with mock.patch.object(devices, "open_cameras", cameras):
+  with (
+    mock.patch.object(devices, "open_cameras", cameras),
+    mock.patch.object(policy_process, "Recorder", recorder),
+  ):
     policy_process.main(robot, board_name, options, peer)
 
 
@@ -95,17 +113,12 @@ def folder(tmp_path_factory) -> Path:
 
 def test_an_unplugged_camera_stops_the_arm_and_its_episode_is_in_the_log(folder):
   contract = policy_folder.load(folder / "policy").contract
-  target = functools.partial(policy, folder)
+  target = functools.partial(policy, folder, "log", FRAMES, Recorder)
   with (
     rig(target, contract) as (board, run),
     Board(run.plant, simulation.RECORDS) as plant,
   ):
-    until(lambda: bool(board["policy"].read()["ready"]))
-    board["order"].write(
-      {"number": 1, "phase": Phase.HOME, "target": NEUTRAL, "close": 1}
-    )
-    until(lambda: is_done(board, 1))
-    board["order"].write({"number": 2, "phase": Phase.PLAY})
+    begin_episode(board)
     until(lambda: text(board["policy"].read()["error"]) == FAULT)
     assert speed(plant) > 0.3
     assert until(lambda: speed(plant) < 0.01) < 0.5
@@ -124,6 +137,30 @@ def test_an_unplugged_camera_stops_the_arm_and_its_episode_is_in_the_log(folder)
   (kept,) = log.episodes
   assert len(kept.actions) == found["actions"] == FRAMES
   assert kept.success is None
+
+
+def test_a_disk_that_fills_ends_the_session_with_one_line(folder):
+  contract = policy_folder.load(folder / "policy").contract
+  target = functools.partial(policy, folder, "full", 1000, FullDisk)
+  with rig(target, contract) as (board, run):
+    begin_episode(board)
+    until(lambda: board["policy"].read()["actions"] >= 3)
+    board["order"].write({"number": 3, "phase": Phase.IDLE})
+    until(lambda: not run.control.is_alive() and not run.policy.is_alive())
+    state, found = board["state"].read(), board["policy"].read()
+    error = text(found["error"])
+    assert "full" in error and "File too large" in error and "\n" not in error
+    assert state["at_rest"] and (found["ended"], found["index"]) == (0, -1)
+  assert lerobot.read(folder / "full").episodes == []
+
+
+def begin_episode(board: Board) -> None:
+  """Homes the arm, and begins an episode as order 2."""
+  until(lambda: bool(board["policy"].read()["ready"]))
+  home = {"number": 1, "phase": Phase.HOME, "target": NEUTRAL, "close": 1}
+  board["order"].write(home)
+  until(lambda: is_done(board, 1))
+  board["order"].write({"number": 2, "phase": Phase.PLAY})
 
 
 def compiling(peer: Any) -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from apnpql_jax.data import lerobot
 from apnpql_jax.errors import DeviceError, RunStopped
-from apnpql_jax.robot import policy_folder, simulated
+from apnpql_jax.robot import policy_folder, policy_process, session, simulated
 from apnpql_jax.robot.board import Phase
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
@@ -70,9 +70,15 @@ def policy(tmp_path_factory) -> Iterator[policy_folder.PolicyFolder]:
 
 
 def killed_in(
-  phase: Phase, name: str, policy: policy_folder.PolicyFolder, log: Path, monkeypatch
+  phase: Phase,
+  name: str,
+  policy: policy_folder.PolicyFolder,
+  log: Path,
+  monkeypatch,
+  *,
+  number: int = signal.SIGKILL,
 ) -> dict[str, Any]:
-  """Runs a session, one of whose processes is killed while its arm moves."""
+  """Runs a session, one of whose processes gets a signal while its arm moves."""
   wait = Session.wait_until_ready
 
   def ready(session: Session) -> None:
@@ -86,7 +92,7 @@ def killed_in(
     while board["policy"].read()["actions"] < played:
       time.sleep(0.01)
     assert session.processes is not None
-    session.processes.kill(name)
+    session.processes.send_signal(name, number)
 
   monkeypatch.setattr(Session, "wait_until_ready", ready)
   robot = Robot("simulated", policy.contract, Cell(), Clock(8.0))
@@ -128,3 +134,38 @@ def test_the_end_of_a_process_leaves_the_log_and_code_3(
   else:
     assert kept["dataset_index"] == 0
     assert len(episodes[0].actions) == kept["actions"]
+
+
+@pytest.mark.slow
+def test_a_policy_that_hangs_ends_the_session_with_the_arm_at_rest(
+  policy, tmp_path, monkeypatch
+):
+  pytest.importorskip("pyarrow")
+  monkeypatch.setattr(policy_process, "END_S", 3.0)
+  log = tmp_path / "log"
+  stop = {"number": signal.SIGSTOP}
+  found = killed_in(Phase.PLAY, "policy", policy, log, monkeypatch, **stop)
+  assert (found["exit_code"], found["episodes"]) == (3, 1)
+  assert found["failure"] == "policy: it does not end its episode"
+  assert found["reasons"] == ["policy: two periods late"]
+  assert found["arm"] == "the arm is at rest"
+  kept = json.loads((log / EVENTS).read_text())
+  assert kept["dataset_index"] is None and kept["solved"] is None
+
+
+@pytest.mark.slow
+def test_a_control_that_hangs_ends_the_session_with_an_unknown_arm(
+  policy, tmp_path, monkeypatch
+):
+  """The policy plays on until its time is over; nobody commands the arm."""
+  pytest.importorskip("pyarrow")
+  monkeypatch.setattr(session, "REST_S", 1.0)
+  log = tmp_path / "log"
+  short = policy_folder.PolicyFolder(policy.path, policy.contract | CONTRACT)
+  stop = {"number": signal.SIGSTOP}
+  found = killed_in(Phase.PLAY, "control", short, log, monkeypatch, **stop)
+  assert (found["exit_code"], found["episodes"]) == (3, 1)
+  assert found["failure"] == "robot: the arm does not come to rest"
+  assert found["arm"] == UNKNOWN
+  (kept,) = lerobot.read(log).episodes
+  assert len(kept.actions) > 3
