@@ -38,10 +38,22 @@ class Control:
     *,
     events: Connection | None = None,
     clock: Clock | None = None,
+    watchdog_s: float = np.inf,
   ):
-    """Keeps the devices; ``events`` gets (time, mode, reason) at each change."""
+    """Keeps what it acts on.
+
+    Args:
+      arm: The arm, connected.
+      hand: The gripper.
+      core: What turns measurements and actions into commands.
+      board: The board.
+      events: Gets (time, mode, reason) at each change.
+      clock: The clock of the session.
+      watchdog_s: Time between two cycles after which a motion ends where it is.
+    """
     self._arm, self._hand, self._core, self._board = arm, hand, core, board
     self._events, self._clock = events, clock or Clock()
+    self._watchdog = watchdog_s
     self._number, self._phase, self._done = 0, Phase.IDLE, False
     self._began = 0.0
     self._target, self._closed = np.zeros(6), False
@@ -185,10 +197,17 @@ class Control:
         self._events.send((now, command.mode.name.lower(), command.reason))
 
   def _note_period(self, now: float) -> None:
-    """Counts the time since the last cycle, unless that has waited for the arm."""
+    """Counts the time since the last cycle, unless that has waited for the arm.
+
+    After a long one, the arm is at rest at its last command, or nearly so. So the next
+    command must not go on at the former speed.
+    """
+    step = now - self._last if self._last else 0.0
     if self._last:
-      step = (now - self._last) / PERIOD_BIN_S
-      self._periods[int(min(step, PERIOD_BINS - 1))] += 1
+      self._periods[int(min(step / PERIOD_BIN_S, PERIOD_BINS - 1))] += 1
+    if self._is_moving and step > self._watchdog:
+      self._core.limiter.halt()
+      self._core.supervisor.stop(f"control: {1e3 * step:.0f} ms without a cycle")
     self._last = now
 
   def _publish(self, state: ArmState) -> None:

@@ -20,6 +20,12 @@ from apnpql_jax.robot.supervisor import CAMERAS
 
 ROBOTS = ("ur5e", "simulated", "double")
 
+INTERRUPTS = (
+  *(signal.SIGINT, signal.SIGTERM, signal.SIGHUP),
+  *(signal.SIGQUIT, signal.SIGTSTP),  # Ctrl-\ and Ctrl-Z.
+)
+"""Signals that a terminal or an operator sends to all processes at once."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Robot:
@@ -151,8 +157,8 @@ def calibrated_modes(robot: Robot) -> dict[str, Any]:
 
 
 def leave_interrupts_to_the_main_process() -> None:
-  """Ignores signals to all processes: the main process brakes first."""
-  for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP):
+  """Ignores ``INTERRUPTS``: the main process brakes first."""
+  for number in INTERRUPTS:
     signal.signal(number, signal.SIG_IGN)
 
 

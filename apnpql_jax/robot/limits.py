@@ -192,6 +192,10 @@ class MotionLimiter:
     near = self._near(slower, measured)
     return self._advance(near.clip(np.minimum(slower, 0.0), np.maximum(slower, 0.0)))
 
+  def halt(self) -> None:
+    """Leaves the command where it is, for an arm that is at rest there."""
+    self.velocity = np.zeros(6)
+
   @property
   def at_rest(self) -> bool:
     """Whether the command stands still."""

@@ -6,6 +6,7 @@ from collections.abc import Generator, Sequence
 import contextlib
 import dataclasses
 import json
+import os
 from pathlib import Path
 import shutil
 import signal
@@ -25,7 +26,7 @@ from apnpql_jax.errors import (
   one_line,
 )
 from apnpql_jax.robot import replay
-from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.devices import INTERRUPTS, Robot
 from apnpql_jax.robot.episodes import Homing, Options, Outcome
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.session import Session
@@ -33,7 +34,7 @@ from apnpql_jax.robot.supervisor import NO_ACTION
 from apnpql_jax.runs.metrics import wilson_interval
 
 EVENTS = "episodes.jsonl"
-"""File in the folder of a log: an episode per line, with each hold and stop."""
+"""File in the folder of a log: an episode per line, with each change of the mode."""
 
 
 def run(
@@ -54,7 +55,7 @@ def run(
     FileError: The log exists, or the log to replay is no log or does not fit the
       policy.
     DeviceError: A device or process has failed before the arm moved.
-    RunStopped: SIGINT, SIGTERM or SIGHUP came; with what is known about the arm.
+    RunStopped: One of ``INTERRUPTS`` came; with what is known about the arm.
   """
   if options.replay is not None:
     replay.recorded_actions(Path(options.replay), policy.contract)
@@ -132,16 +133,19 @@ def _new_log(folder: str | None, outcomes: Sequence[Outcome]) -> Generator[None]
 
 @contextlib.contextmanager
 def catching_signals() -> Generator[list[int]]:
-  """Yields a list that gets signals which otherwise would end all at once.
+  """Yields a list that gets signals which would end or suspend the main process.
 
   A session ends at the first one, with the arm at rest.
   """
   caught: list[int] = []
+
+  def note(number: int, _: object) -> None:
+    caught.append(number)
+    if number == signal.SIGTSTP:  # Others of the pipeline are suspended now.
+      os.killpg(0, signal.SIGCONT)
+
   wake = signal.set_wakeup_fd(-1)  # Of ``runs.signals``, which would end at once.
-  before = {
-    number: signal.signal(number, lambda number, _: caught.append(number))
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-  }
+  before = {number: signal.signal(number, note) for number in INTERRUPTS}
   try:
     yield caught
   finally:

@@ -120,7 +120,14 @@ class Rig:
       device.connect()
     hand = Hand(self.gripper, open_rad=0.0, closed_rad=1.1)
     core = Core(Cell().limits(CONTRACT))
-    self.control = Control(self.arm, hand, core, board, clock=self.clock)
+    self.control = Control(
+      self.arm,
+      hand,
+      core,
+      board,
+      clock=self.clock,
+      watchdog_s=core.limits.joint_age,
+    )
     self.number, self.actions = 0, 0
     self.values: np.ndarray | None = None
     """What the policy wants, or None for a policy that is silent."""

@@ -217,5 +217,22 @@ def test_late_cycles_are_counted_but_not_waits_for_the_arm(rig):
   assert late(rig) == before + 2
 
 
+@pytest.mark.parametrize("seconds", [0.03, 0.1])
+def test_an_arm_that_got_no_commands_stays_where_it_has_come_to_rest(rig, seconds):
+  rig.go_home(closed=True)
+  rig.run_until_done()
+  rig.play(1.0, 0, 0, 0, 0, 0, close=True)
+  rig.run(0.8)
+  assert rig.state["mode"] == Mode.FOLLOW and rig.speed > 0.5
+  command = rig.state["command"]
+  rig.turn(seconds)
+  assert rig.state["mode"] == Mode.STOP
+  assert rig.reason == f"control: {1e3 * seconds:.0f} ms without a cycle"
+  np.testing.assert_array_equal(rig.state["command"], command)
+  rig.run(0.3)
+  assert rig.state["done"] and rig.speed < 0.01
+  np.testing.assert_allclose(rig.state["position"], command, atol=0.01)
+
+
 def late(rig: Rig) -> int:
   return int(rig.state["periods"][round(2 * TIMESTEP / PERIOD_BIN_S) :].sum())

@@ -61,13 +61,14 @@ class Controller:
     """
     self.plant, self.model, self.remote = plant, model, remote
     self._slider = speed_slider
-    self.safety, self.running = "NORMAL", False
+    self.safety, self.running, self.programs = "NORMAL", False, 0
     self._boot = time.monotonic()
     self._inputs: dict[str, float] = {}
     self._executing, self._answer = False, 0
 
   def upload(self, script: bytes) -> None:
     """Starts a program, which ends in ``end``, if the arm may move."""
+    self.programs += 1
     if script.rstrip().endswith(b"end") and self.remote and self.safety == "NORMAL":
       self.running, self._executing, self._answer = True, False, _READY
 

@@ -206,6 +206,7 @@ class Remote:
       "position": plant.position.tolist(),
       "target": plant.target.tolist(),
       "finger": plant.finger,
+      "programs": self._controller.programs,
       "program_runs": self._controller.running,
       "qpos": data.qpos.tolist(),
       "mocap_pos": data.mocap_pos.tolist(),

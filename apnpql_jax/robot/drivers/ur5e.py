@@ -82,13 +82,13 @@ class UR5e:
       self._receive = self._within(
         receive.RTDEReceiveInterface, self._host, 1 / TIMESTEP, VARIABLES
       )
+      self._reports = Reports(self._host, self._receive)
+      self._reports.check()  # First: the next line sends the program.
       self._control = self._within(
         control.RTDEControlInterface, self._host, 1 / TIMESTEP
       )
       # Its destructor ends the process if the connection is lost: it never runs.
       ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._control))
-      self._reports = Reports(self._host, self._receive)
-      self._reports.check()
     except DeviceError:
       self.disconnect()
       raise

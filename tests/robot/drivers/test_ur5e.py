@@ -18,6 +18,7 @@ from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot import doubles
 from apnpql_jax.robot.doubles.controller import SERIAL, VERSION
 from apnpql_jax.robot.doubles.plant import DRIFT
+from apnpql_jax.robot.doubles.server import ask
 from apnpql_jax.robot.drivers.ur5e import UR5e
 from apnpql_jax.robot.limits import TIMESTEP
 
@@ -213,6 +214,18 @@ def test_a_controller_that_will_not_do_is_one_line(controller, text):
   ):
     pass
   assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("cause", ["protective_stop", "emergency_stop"])
+def test_a_stopped_arm_gets_no_program(cause):
+  server = doubles.serve("push_plate")
+  host, _ = server.greeting
+  ask(host, cause)
+  arm = UR5e(host, payload_kg=0.5, payload_cog_m=[0, 0, 0.05])
+  with pytest.raises(DeviceError, match=cause.replace("_", " ")):
+    arm.connect()
+  assert ask(host, "state")["programs"] == 0
+  server.close()
 
 
 def test_a_slowed_arm_does_not_start():
