@@ -120,7 +120,7 @@ def robot(args: Robot) -> dict[str, Any]:
     return _calibrate(args, opened)
   with setup.doubled(opened) as opened:
     if args.action == "check":
-      from apnpql_jax.robot.check import check
+      from apnpql_jax.robot.check.command import check
 
       return check(opened, policy, admittance=args.admittance)
     return _run(args, opened, policy)

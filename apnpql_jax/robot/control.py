@@ -10,7 +10,7 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 
-from apnpql_jax.robot.board import PERIOD_BIN_S, PERIOD_BINS, Board, Phase
+from apnpql_jax.robot.blackboard import PERIOD_BIN_S, PERIOD_BINS, Blackboard, Phase
 from apnpql_jax.robot.clock import Clock
 from apnpql_jax.robot.core import Command, Core
 from apnpql_jax.robot.hand import Hand
@@ -34,7 +34,7 @@ class Control:
     arm: Arm,
     hand: Hand,
     core: Core,
-    board: Board,
+    board: Blackboard,
     *,
     events: Connection | None = None,
     clock: Clock | None = None,

@@ -10,13 +10,14 @@ import contextlib
 import gc
 import json
 import math
-from multiprocessing import connection, parent_process
+from multiprocessing import parent_process
+from multiprocessing.connection import Connection
 import os
 import select
 import sys
 
 from apnpql_jax.robot import devices
-from apnpql_jax.robot.board import Board, Phase
+from apnpql_jax.robot.blackboard import Blackboard, Phase
 from apnpql_jax.robot.clock import Clock
 from apnpql_jax.robot.control import Control
 from apnpql_jax.robot.core import Core
@@ -30,11 +31,9 @@ REST_S = 1.0
 REALTIME_PRIORITY = 20
 """Priority of the process for a real arm, if the system grants it."""
 
-Pipe = connection.Connection
-
 
 def main(
-  robot: Robot, board_name: str, options: dict, events: Pipe, peer: Pipe
+  robot: Robot, board_name: str, options: dict, events: Connection, peer: Connection
 ) -> None:
   """Runs the process.
 
@@ -48,7 +47,7 @@ def main(
   devices.leave_interrupts_to_the_main_process()
   # More often than every 5 ms, so that the drivers' threads do not hold up cycles.
   sys.setswitchinterval(5e-4)
-  board = Board(board_name)
+  board = Blackboard(board_name)
   admittance = robot.cell.admittance() if options["admittance"] else None
   core = Core(robot.cell.limits(robot.contract), admittance=admittance)
   try:
@@ -78,7 +77,7 @@ def main(
     board.close()
 
 
-def _loop(control: Control, clock: Clock, peer: Pipe) -> None:
+def _loop(control: Control, clock: Clock, peer: Connection) -> None:
   """Runs cycles until told to quit, and to rest if another process has ended."""
   parent = parent_process()
   poll = select.poll()
@@ -101,7 +100,7 @@ def _loop(control: Control, clock: Clock, peer: Pipe) -> None:
     clock.sleep(due - clock.now())
 
 
-def _last_words(peer: Pipe) -> str:
+def _last_words(peer: Connection) -> str:
   """Returns why the policy process has ended."""
   with contextlib.suppress(EOFError, OSError):
     return str(peer.recv())

@@ -55,7 +55,7 @@ class Robot:
 def make_arm(robot: Robot, *, reads: bool = False) -> Any:
   """Returns the arm, not connected; with ``reads``, one that takes no commands."""
   if robot.kind == "simulated":
-    simulated = importlib.import_module("apnpql_jax.robot.simulated")
+    simulated = importlib.import_module("apnpql_jax.robot.simulated.devices")
     return simulated.SimulatedArm(robot.plant)
   cell = robot.cell
   if reads:
@@ -70,7 +70,7 @@ def make_arm(robot: Robot, *, reads: bool = False) -> Any:
 def make_gripper(robot: Robot) -> Gripper:
   """Returns the gripper, not connected."""
   if robot.kind == "simulated":
-    simulated = importlib.import_module("apnpql_jax.robot.simulated")
+    simulated = importlib.import_module("apnpql_jax.robot.simulated.devices")
     return simulated.SimulatedGripper(robot.plant)
   grippers = importlib.import_module("apnpql_jax.robot.drivers.gripper")
   return grippers.RHP12RN(robot.cell.gripper_port)
@@ -110,7 +110,7 @@ def open_cameras(robot: Robot) -> Generator[tuple[Sequence[Camera], Judge | None
   with contextlib.ExitStack() as stack:
     views = robot.contract["cameras"]
     if robot.kind == "simulated":
-      rendered = importlib.import_module("apnpql_jax.robot.simulated_cameras")
+      rendered = importlib.import_module("apnpql_jax.robot.simulated.cameras")
       cameras: Sequence[Camera]
       cameras, judge = rendered.make(robot.plant, robot.contract)
     elif robot.kind == "double":

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import time
 from typing import Any
 
-from apnpql_jax.robot.board import Board, Phase
+from apnpql_jax.robot.blackboard import Blackboard, Phase
 
 _LOOK_S = 0.01  # Between two looks at the board.
 
@@ -14,7 +14,7 @@ _LOOK_S = 0.01  # Between two looks at the board.
 class Orders:
   """The newest order, and what has become of it."""
 
-  def __init__(self, board: Board):
+  def __init__(self, board: Blackboard):
     """Begins without an order."""
     self._board, self._number = board, 0
 

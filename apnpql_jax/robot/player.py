@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from apnpql_jax.robot.arm_model import ArmModel
-from apnpql_jax.robot.board import Board, Phase
+from apnpql_jax.robot.blackboard import Blackboard, Phase
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.protocols import Camera, Frame, Judge
 from apnpql_jax.robot.recorder import Recorder
@@ -78,7 +78,7 @@ class Player:
   def __init__(
     self,
     robot: Robot,
-    board: Board,
+    board: Blackboard,
     cameras: Sequence[Camera],
     act: Act,
     *,

@@ -10,6 +10,7 @@ import contextlib
 from importlib.metadata import version
 import json
 import math
+from multiprocessing.connection import Connection
 import os
 from pathlib import Path
 import threading
@@ -19,8 +20,7 @@ from typing import Any
 import numpy as np
 
 from apnpql_jax.robot import devices, policy_folder
-from apnpql_jax.robot.board import Board, Phase, text
-from apnpql_jax.robot.control_process import Pipe
+from apnpql_jax.robot.blackboard import Blackboard, Phase, text
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.orders import comes_true
@@ -83,7 +83,9 @@ def replaying(actions: Sequence[np.ndarray]) -> Act:
   return act
 
 
-def main(robot: Robot, board_name: str, options: dict[str, Any], peer: Pipe) -> None:
+def main(
+  robot: Robot, board_name: str, options: dict[str, Any], peer: Connection
+) -> None:
   """Runs the process.
 
   Args:
@@ -98,7 +100,7 @@ def main(robot: Robot, board_name: str, options: dict[str, Any], peer: Pipe) -> 
   ready, ending = threading.Event(), threading.Event()
   args = peer, ready, ending
   threading.Thread(target=_end_with, args=args, daemon=True).start()
-  board = Board(board_name)
+  board = Blackboard(board_name)
 
   def tell(error: Exception) -> None:
     """Ends the motion and the session, with one line for the user."""
@@ -147,7 +149,9 @@ def main(robot: Robot, board_name: str, options: dict[str, Any], peer: Pipe) -> 
     board.close()
 
 
-def _described(robot: Robot, board: Board, cameras: Sequence[Camera]) -> dict[str, Any]:
+def _described(
+  robot: Robot, board: Blackboard, cameras: Sequence[Camera]
+) -> dict[str, Any]:
   """Returns what all devices say of themselves, once arm and gripper are connected.
 
   If they cannot be, this process ends with the control process.
@@ -162,7 +166,9 @@ def _described(robot: Robot, board: Board, cameras: Sequence[Camera]) -> dict[st
   }
 
 
-def _end_with(peer: Pipe, ready: threading.Event, ending: threading.Event) -> None:
+def _end_with(
+  peer: Connection, ready: threading.Event, ending: threading.Event
+) -> None:
   """Ends this process when the one at the other end has ended.
 
   Before it is ``ready``, there is no episode to write.

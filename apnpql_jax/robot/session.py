@@ -12,14 +12,15 @@ from typing import Any, Self
 import numpy as np
 
 from apnpql_jax.errors import INTERRUPTED, DeviceError, RunStopped
-from apnpql_jax.robot import policy_process, simulated
-from apnpql_jax.robot.board import PERIOD_BIN_S, Board, Phase, text
+from apnpql_jax.robot import policy_process
+from apnpql_jax.robot.blackboard import PERIOD_BIN_S, Blackboard, Phase, text
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.episodes import SOLVED, TIME_LIMIT, Homing, Options, Outcome
 from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.orders import Orders, comes_true
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.processes import Processes
+from apnpql_jax.robot.simulated import devices as simulated
 from apnpql_jax.robot.supervisor import Mode
 
 START_S = 600.0
@@ -57,7 +58,7 @@ class Session(contextlib.AbstractContextManager):
     self.rest = "the arm has not moved"
     """What is known about the arm after ``close``."""
     self._stack = contextlib.ExitStack()
-    self.board = self._stack.enter_context(Board())
+    self.board = self._stack.enter_context(Blackboard())
     self._orders = Orders(self.board)
     self._operator: simulated.Operator | None = None
     self.homing = Homing()

@@ -20,7 +20,7 @@ import numpy as np
 from apnpql_jax.config import files
 from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot import policy_folder, setup
-from apnpql_jax.robot.board import PERIOD_BIN_S
+from apnpql_jax.robot.blackboard import PERIOD_BIN_S
 from apnpql_jax.robot.episodes import Options
 from apnpql_jax.robot.session import Session
 from apnpql_jax.testing import SMALL, export_untrained

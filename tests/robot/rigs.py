@@ -14,17 +14,17 @@ from typing import Any, Self
 import numpy as np
 
 from apnpql_jax.errors import DeviceError
-from apnpql_jax.robot import simulated
-from apnpql_jax.robot.board import Board, Phase, text
+from apnpql_jax.robot.blackboard import Blackboard, Phase, text
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
 from apnpql_jax.robot.control import Control
 from apnpql_jax.robot.core import Core
 from apnpql_jax.robot.hand import Hand
 from apnpql_jax.robot.limits import TIMESTEP
-from apnpql_jax.robot.plant import Plant
 from apnpql_jax.robot.protocols import ArmState, GripperState
-from apnpql_jax.robot.simulation import RECORDS, Scene, Simulation
+from apnpql_jax.robot.simulated.devices import SimulatedArm, SimulatedGripper
+from apnpql_jax.robot.simulated.plant import Plant
+from apnpql_jax.robot.simulated.process import RECORDS, Scene, Simulation
 
 CONTRACT = {
   "control_period_s": 0.15,
@@ -50,7 +50,7 @@ class TurnedClock(Clock):
     self.passed[0] += max(seconds, 0.0)
 
 
-class Arm(simulated.SimulatedArm):
+class Arm(SimulatedArm):
   """The simulated arm, whose cable may be pulled out."""
 
   lost_at = NEVER
@@ -80,7 +80,7 @@ class Arm(simulated.SimulatedArm):
     return self._last
 
 
-class Gripper(simulated.SimulatedGripper):
+class Gripper(SimulatedGripper):
   """The simulated gripper, whose cable may be pulled out, as its driver shows it."""
 
   lost_at = NEVER
@@ -100,8 +100,8 @@ class Rig:
 
   def __init__(
     self,
-    board: Board,
-    plant_board: Board,
+    board: Blackboard,
+    plant_board: Blackboard,
     *,
     seed: int = 0,
     task_name: str = "push_plate",
@@ -209,7 +209,7 @@ class Rig:
   @contextlib.contextmanager
   def opened(cls, **options: Any) -> Generator[Self]:
     """Yields a rig with boards of its own."""
-    with Board() as board, Board(records=RECORDS) as plant_board:
+    with Blackboard() as board, Blackboard(records=RECORDS) as plant_board:
       made = cls(board, plant_board, **options)
       yield made
       made.arm.disconnect()

@@ -227,7 +227,8 @@ def test_a_real_arm_does_not_move_unasked(exported, real_cell, capsys, monkeypat
 
 def test_the_control_side_imports_no_jax():
   code = (
-    "import sys; import apnpql_jax.robot.session, apnpql_jax.robot.simulated;"
+    "import sys; import apnpql_jax.robot.session;"
+    "import apnpql_jax.robot.simulated.devices;"
     "import apnpql_jax.robot.control_process, apnpql_jax.robot.policy_process;"
     "print('jax' in sys.modules)"
   )

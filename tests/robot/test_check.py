@@ -21,19 +21,13 @@ import pytest
 
 from apnpql_jax.cli.main import main
 from apnpql_jax.errors import DeviceError
-from apnpql_jax.robot import (
-  cell,
-  check,
-  check_program,
-  devices,
-  policy_folder,
-  policy_process,
-  setup,
-)
+from apnpql_jax.robot import cell, devices, policy_folder, policy_process, setup
 from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.calibration import files, limits
 from apnpql_jax.robot.calibration.lenses import Lens
 from apnpql_jax.robot.cell import Cell
+from apnpql_jax.robot.check import program
+from apnpql_jax.robot.check.command import check
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.doubles.server import ask
 from apnpql_jax.robot.drivers import realsense
@@ -108,7 +102,7 @@ class Bench:
 
   def check(self) -> dict[str, Any]:
     robot = Robot("double", self.policy.contract, self.cell)
-    return check.check(robot, self.policy)
+    return check(robot, self.policy)
 
 
 @pytest.fixture
@@ -117,7 +111,7 @@ def bench(exported, monkeypatch) -> Bench:
   policy = policy_folder.load(exported)
   views = policy.contract["cameras"]
   found = Bench(policy, Arm(policy.neutral), [Camera(views[x]) for x in views])
-  found.act = check_program.rest
+  found.act = program.rest
   monkeypatch.setattr(devices, "make_arm", lambda robot, reads: found.arm)
   monkeypatch.setattr(devices, "make_gripper", lambda robot: found.gripper)
   monkeypatch.setattr(
@@ -264,7 +258,7 @@ def test_a_real_arm_is_checked_before_its_calibration(bench, tmp_path, monkeypat
   path = tmp_path / "robot.toml"
   path.write_text(cell.EXAMPLE)
   robot = setup.describe("ur5e", bench.policy, path, calibrated=False)
-  found = check.check(robot, bench.policy)
+  found = check(robot, bench.policy)
   assert found["not_ready"] == ["calibration"]
   assert "calibration.json does not exist; make it with" in found["calibration"]
 
@@ -285,7 +279,7 @@ def test_a_camera_that_has_moved_fails_the_calibration_alone(
   cameras = dict(zip(CAMERAS, bench.cameras, strict=True))
   monkeypatch.setattr(devices, "open_cameras", OPEN_CAMERAS)
   monkeypatch.setattr(realsense, "RealSense", lambda serial, **kw: cameras[serial])
-  found = check.check(Robot("ur5e", contract, bench.cell), bench.policy)
+  found = check(Robot("ur5e", contract, bench.cell), bench.policy)
   assert found["not_ready"] == ["calibration"]
   assert "20.0 mm off along x" in found["calibration"]
   assert "frames of 3" in found["camera global"]
@@ -356,9 +350,7 @@ def double(policy: Path, monkeypatch, **controller: Any) -> Generator[Robot]:
 
   serve = functools.partial(doubles.serve, noise=False, **controller)
   monkeypatch.setattr(doubles, "serve", serve)
-  monkeypatch.setattr(
-    policy_process, "load_program", lambda *args, **kw: check_program.rest
-  )
+  monkeypatch.setattr(policy_process, "load_program", lambda *args, **kw: program.rest)
   robot = setup.describe("double", policy_folder.load(policy), Path("none"))
   with setup.doubled(robot) as started:
     yield started
@@ -394,7 +386,7 @@ def test_the_arm_of_a_double_is_only_read(
     if fault:
       ask(host, fault)
     before = ask(host, "state")
-    found = check.check(robot, policy_folder.load(exported))
+    found = check(robot, policy_folder.load(exported))
     after = ask(host, "state")
   for text in PROBLEMS:
     assert (text in found["arm"]) == (text in texts), found["arm"]

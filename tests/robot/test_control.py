@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rigs import NEUTRAL, Rig
 
-from apnpql_jax.robot.board import PERIOD_BIN_S, Phase
+from apnpql_jax.robot.blackboard import PERIOD_BIN_S, Phase
 from apnpql_jax.robot.control import GRIP_S
 from apnpql_jax.robot.hand import THERE_RAD
 from apnpql_jax.robot.limits import TIMESTEP

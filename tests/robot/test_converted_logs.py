@@ -27,13 +27,13 @@ from apnpql_jax.data.lerobot import conversion
 from apnpql_jax.envs.cameras import camera_renderer
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.errors import FileError
-from apnpql_jax.robot import simulated, simulated_cameras
-from apnpql_jax.robot.board import Phase
+from apnpql_jax.robot.blackboard import Phase
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.player import Player
 from apnpql_jax.robot.recorder import Recorder
+from apnpql_jax.robot.simulated import cameras, devices
 from apnpql_jax.sim import motors
 from apnpql_jax.training import expert
 
@@ -73,8 +73,8 @@ class Session:
     self.rig, self.seen = rig, []
     plant = rig.plant_board
     robot = Robot("simulated", CONTRACT, Cell(), RigClock(rig=rig), plant.name)
-    self._cameras, judge = simulated_cameras.make(plant.name, CONTRACT)
-    self._operator = simulated.Operator(plant, self._until)
+    self._cameras, judge = cameras.make(plant.name, CONTRACT)
+    self._operator = devices.Operator(plant, self._until)
     self._rng = np.random.default_rng(0)
     names = judge.environment_names()
     self._recorder = Recorder(folder, CONTRACT, judged=True, environment=names)

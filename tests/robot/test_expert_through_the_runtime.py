@@ -18,7 +18,7 @@ from apnpql_jax.envs.state import Arrival, EnvState
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.core import Core
 from apnpql_jax.robot.limits import TIMESTEP, Limits
-from apnpql_jax.robot.plant import Plant, Servo
+from apnpql_jax.robot.simulated.plant import Plant, Servo
 from apnpql_jax.robot.supervisor import Action, Mode
 
 EPISODES = 10

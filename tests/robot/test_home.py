@@ -20,7 +20,7 @@ import rigs
 from rigs import NEUTRAL
 
 from apnpql_jax.errors import DeviceError
-from apnpql_jax.robot.board import Board
+from apnpql_jax.robot.blackboard import Blackboard
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.episodes import Homing, Options
@@ -28,8 +28,8 @@ from apnpql_jax.robot.hand import THERE_RAD
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.sensor import load
 from apnpql_jax.robot.session import Session
-from apnpql_jax.robot.simulated import Operator
-from apnpql_jax.robot.simulation import RECORDS
+from apnpql_jax.robot.simulated.devices import Operator
+from apnpql_jax.robot.simulated.process import RECORDS
 from apnpql_jax.sim import motors
 
 CONTRACT: dict[str, Any] = {
@@ -81,7 +81,7 @@ def playing(*, operator: bool) -> Generator[tuple[Session, Rig]]:
   processes: Any = SimpleNamespace(ended=[], events=list)
   session.processes, over = processes, threading.Event()
   with contextlib.ExitStack() as stack:
-    board = stack.enter_context(Board(records=RECORDS))
+    board = stack.enter_context(Blackboard(records=RECORDS))
     rig = Rig(session.board, board, task_name="stack_box")
     rig.open_fingers()
     if operator:

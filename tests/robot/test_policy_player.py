@@ -16,7 +16,7 @@ from rigs import START, TurnedClock
 
 from apnpql_jax.data import lerobot
 from apnpql_jax.errors import DeviceError
-from apnpql_jax.robot.board import Board, Phase
+from apnpql_jax.robot.blackboard import Blackboard, Phase
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
 from apnpql_jax.robot.devices import Robot
@@ -65,7 +65,7 @@ class Episode:
 
   def __init__(
     self,
-    board: Board,
+    board: Blackboard,
     thinks: Callable[[int], float] = lambda _: 0.005,
     *,
     frames: int = 1000,
@@ -97,8 +97,8 @@ class Episode:
 
 
 @pytest.fixture
-def board() -> Iterator[Board]:
-  with Board() as made:
+def board() -> Iterator[Blackboard]:
+  with Blackboard() as made:
     yield made
 
 

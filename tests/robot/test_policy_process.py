@@ -23,13 +23,14 @@ from test_processes import CLOCK, NEUTRAL, is_done, rig, speed, until
 
 from apnpql_jax.data import lerobot
 from apnpql_jax.errors import DeviceError
-from apnpql_jax.robot import devices, policy_folder, policy_process, simulation
-from apnpql_jax.robot.board import Board, Phase, text
+from apnpql_jax.robot import devices, policy_folder, policy_process
+from apnpql_jax.robot.blackboard import Blackboard, Phase, text
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.protocols import Frame
 from apnpql_jax.robot.recorder import Recorder
+from apnpql_jax.robot.simulated import process as simulation
 from apnpql_jax.robot.supervisor import CAMERAS, Mode
 from apnpql_jax.testing import export_untrained
 
@@ -116,7 +117,7 @@ def test_an_unplugged_camera_stops_the_arm_and_its_episode_is_in_the_log(folder)
   target = functools.partial(policy, folder, "log", FRAMES, Recorder)
   with (
     rig(target, contract) as (board, run),
-    Board(run.plant, simulation.RECORDS) as plant,
+    Blackboard(run.plant, simulation.RECORDS) as plant,
   ):
     begin_episode(board)
     until(lambda: text(board["policy"].read()["error"]) == FAULT)
@@ -154,7 +155,7 @@ def test_a_disk_that_fills_ends_the_session_with_one_line(folder):
   assert lerobot.read(folder / "full").episodes == []
 
 
-def begin_episode(board: Board) -> None:
+def begin_episode(board: Blackboard) -> None:
   """Homes the arm, and begins an episode as order 2."""
   until(lambda: bool(board["policy"].read()["ready"]))
   home = {"number": 1, "phase": Phase.HOME, "target": NEUTRAL, "close": 1}

@@ -20,11 +20,12 @@ from typing import Any
 import numpy as np
 from rigs import NEUTRAL
 
-from apnpql_jax.robot import control_process, simulated, simulation
-from apnpql_jax.robot.board import Board, Phase, text
+from apnpql_jax.robot import control_process
+from apnpql_jax.robot.blackboard import Blackboard, Phase, text
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
 from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.simulated import devices as simulated, process as simulation
 from apnpql_jax.robot.supervisor import Mode
 
 CONTRACT: dict[str, Any] = {
@@ -51,7 +52,7 @@ if __name__ == "__main__":
 
 def policy(board_name: str, peer: Any, clock: Clock) -> None:
   """Moves the shoulder as fast as allowed, without cameras or JAX."""
-  board, number = Board(board_name), 0
+  board, number = Blackboard(board_name), 0
   while not peer.poll(0):
     state, now = board["state"].read(), clock.now()
     if state["phase"] == Phase.PLAY:
@@ -97,11 +98,11 @@ class Rig:
 @contextlib.contextmanager
 def rig(
   target: Callable[[str, Any, Clock], None] = policy, contract: dict = CONTRACT
-) -> Generator[tuple[Board, Rig]]:
+) -> Generator[tuple[Blackboard, Rig]]:
   """Starts a plant, a control process, and as the policy a function of this module."""
   context = get_context("spawn")
   robot = Robot("simulated", contract, Cell(), CLOCK)
-  with simulated.started(robot) as robot, Board() as board:
+  with simulated.started(robot) as robot, Blackboard() as board:
     receiver, sender = context.Pipe(duplex=False)
     one, other = context.Pipe()
     args = robot, board.name, {"admittance": True}, sender, one
@@ -133,7 +134,7 @@ def until(condition: Callable[[], bool], seconds: float = 120.0) -> float:
   return (time.monotonic() - begin) / CLOCK.slowdown
 
 
-def start_motion(board: Board) -> None:
+def start_motion(board: Blackboard) -> None:
   """Homes the arm, and returns when the policy moves it.
 
   A busy machine may starve a process for so long that a limit stops the arm, which is
@@ -153,22 +154,22 @@ def start_motion(board: Board) -> None:
   raise AssertionError(f"the arm stopped: {reasons}")
 
 
-def is_done(board: Board, number: int) -> bool:
+def is_done(board: Blackboard, number: int) -> bool:
   state = board["state"].read()
   return bool(state["number"] == number and state["done"])
 
 
-def is_fast(board: Board) -> bool:
+def is_fast(board: Blackboard) -> bool:
   return abs(board["state"].read()["velocity"][0]) > 0.5
 
 
-def speed(plant: Board) -> float:
+def speed(plant: Blackboard) -> float:
   """Returns the arm's largest joint velocity, rad/s."""
   return float(np.abs(plant["plant"].read()["velocity"]).max())
 
 
 def test_a_killed_policy_brings_the_arm_to_rest_and_control_has_no_jax():
-  with rig() as (board, run), Board(run.plant, simulation.RECORDS) as plant:
+  with rig() as (board, run), Blackboard(run.plant, simulation.RECORDS) as plant:
     start_motion(board)
     run.policy.kill()
     assert until(lambda: speed(plant) < 0.01) < 0.5
@@ -182,7 +183,7 @@ def test_a_killed_policy_brings_the_arm_to_rest_and_control_has_no_jax():
 
 
 def test_a_killed_control_process_ends_the_policy_and_the_arm_keeps_its_place():
-  with rig() as (board, run), Board(run.plant, simulation.RECORDS) as plant:
+  with rig() as (board, run), Blackboard(run.plant, simulation.RECORDS) as plant:
     start_motion(board)
     run.control.kill()
     until(lambda: not run.policy.is_alive())

@@ -15,14 +15,15 @@ import pytest
 
 from apnpql_jax.data import lerobot
 from apnpql_jax.errors import DeviceError, RunStopped
-from apnpql_jax.robot import policy_folder, policy_process, session, simulated
-from apnpql_jax.robot.board import Phase
+from apnpql_jax.robot import policy_folder, policy_process, session
+from apnpql_jax.robot.blackboard import Phase
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.episodes import Options
 from apnpql_jax.robot.run import EVENTS, run
 from apnpql_jax.robot.session import UNKNOWN, Session
+from apnpql_jax.robot.simulated import devices as simulated
 from apnpql_jax.robot.supervisor import Mode
 from apnpql_jax.testing import export_untrained
 

@@ -10,7 +10,7 @@ import pytest
 import rigs
 from rigs import NEUTRAL
 
-from apnpql_jax.robot.board import Board, Phase
+from apnpql_jax.robot.blackboard import Blackboard, Phase
 from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.sensor import load
 from apnpql_jax.robot.supervisor import Mode
@@ -22,7 +22,7 @@ PRESS = np.array([0.0, 0.0, 20.0])  # N, upwards
 class Rig(rigs.Rig):
   """A rig that begins near the neutral pose, and on which something may press."""
 
-  def __init__(self, *boards: Board, seed: int):
+  def __init__(self, *boards: Blackboard, seed: int):
     super().__init__(*boards, seed=seed)
     self.plant.put_arm(NEUTRAL + AWAY)
     self.hand = self.plant.model.body("gripper").id

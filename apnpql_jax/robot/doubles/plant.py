@@ -18,7 +18,7 @@ import numpy as np
 from apnpql_jax.config import files
 from apnpql_jax.robot.arm_model import BASE, FLANGE, JOINTS
 from apnpql_jax.robot.limits import TIMESTEP
-from apnpql_jax.robot.plant import subtree
+from apnpql_jax.robot.simulated.plant import subtree
 
 FINGER = "finger_r1"
 SPEED_LIMIT = math.pi  # rad/s, the UR5e's joints, data sheet

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from apnpql_jax.robot import devices
-from apnpql_jax.robot.board import TEXT, Board
+from apnpql_jax.robot.blackboard import TEXT, Blackboard
 from apnpql_jax.robot.clock import Clock
 from apnpql_jax.robot.limits import TIMESTEP
-from apnpql_jax.robot.plant import Plant, Servo
+from apnpql_jax.robot.simulated.plant import Plant, Servo
 
 _MOST = {"qpos": 128, "qvel": 128, "mocap_pos": 24, "mocap_quat": 32}
 """Room for arrays of the scene."""
@@ -98,7 +98,7 @@ def main(name: str, task_name: str, options: dict[str, Any]) -> None:
     options: ``seed`` of the reset states, ``latency_s``, ``clock``.
   """
   devices.leave_interrupts_to_the_main_process()
-  board = Board(name, RECORDS)
+  board = Blackboard(name, RECORDS)
   try:
     tasks = importlib.import_module("apnpql_jax.tasks")
     task = tasks.make_task(task_name)
@@ -116,7 +116,7 @@ def main(name: str, task_name: str, options: dict[str, Any]) -> None:
 class Simulation:
   """A plant behind its board."""
 
-  def __init__(self, board: Board, plant: Plant, scene: Scene):
+  def __init__(self, board: Blackboard, plant: Plant, scene: Scene):
     """Keeps them, and parks the arm; ``scene`` places the objects."""
     self._board, self._plant, self._scene = board, plant, scene
     self._shown = self._parked = self._zeroed = self._variant = 0

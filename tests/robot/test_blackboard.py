@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from apnpql_jax import testing
-from apnpql_jax.robot.board import Board, Record, text
+from apnpql_jax.robot.blackboard import Blackboard, Record, text
 
 FIELDS: Any = [("number", "i8"), ("reason", "S8")]
 FLOOD = {"block": [("number", "i8"), ("values", "i8", 500)]}
@@ -20,14 +20,14 @@ FLOOD = {"block": [("number", "i8"), ("values", "i8", 500)]}
 
 def flood(name: str) -> None:
   """Writes as fast as it can."""
-  board, number = Board(name, FLOOD), 0
+  board, number = Blackboard(name, FLOOD), 0
   while True:
     number += 1
     board["block"].write({"number": number, "values": number})
 
 
 def test_a_reader_never_sees_half_a_record():
-  with Board(records=FLOOD) as board:
+  with Blackboard(records=FLOOD) as board:
     process = get_context("spawn").Process(target=flood, args=(board.name,))
     process.start()
     numbers, end = [], time.monotonic() + 120
@@ -72,7 +72,7 @@ def test_text_is_shown_whatever_its_bytes():
 
 
 def test_long_text_is_cut_between_characters():
-  with Board() as board:
+  with Blackboard() as board:
     board["policy"].write({"error": "a" + 150 * "\u00e9"})
     assert text(board["policy"].read()["error"]) == "a" + 99 * "\u00e9"
     board["devices"].write({"arm": 4096 * "a"})
@@ -92,9 +92,9 @@ ORDERS = {
 @pytest.mark.parametrize("order", ORDERS)
 def test_boards_end_without_a_word_in_any_order(order):
   code = (
-    "from apnpql_jax.robot.board import Board\n"
-    "board = Board()\n"
-    "again = Board(board.name)\n"
+    "from apnpql_jax.robot.blackboard import Blackboard\n"
+    "board = Blackboard()\n"
+    "again = Blackboard(board.name)\n"
     "board['state'].write({'time': 1.0})\n"
     f"{ORDERS[order]}\n"
   )

@@ -16,9 +16,9 @@ import numpy as np
 from apnpql_jax.config import files
 from apnpql_jax.data.lerobot import conversion
 from apnpql_jax.envs.cameras import make_cameras
-from apnpql_jax.robot.board import Board
+from apnpql_jax.robot.blackboard import Blackboard
 from apnpql_jax.robot.protocols import Frame
-from apnpql_jax.robot.simulation import RECORDS
+from apnpql_jax.robot.simulated.process import RECORDS
 from apnpql_jax.robot.supervisor import CAMERAS
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.kinematics import make_kinematics
@@ -50,7 +50,7 @@ class View:
       return *images, self.task.success(state, poses)[0]
 
     self._draw = draw
-    self._board = Board(plant, RECORDS)
+    self._board = Blackboard(plant, RECORDS)
     self.frames: list[Frame] = []
     self._solved, self._environment = False, np.zeros(0, np.float32)
 

@@ -17,7 +17,7 @@ import numpy as np
 from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot import devices
 from apnpql_jax.robot.arm_model import ArmModel
-from apnpql_jax.robot.check_table import Table
+from apnpql_jax.robot.check.table import Table
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.limits import Limits, MotionLimiter
 from apnpql_jax.robot.protocols import ArmState, Frame

@@ -1,6 +1,6 @@
 """The simulated robot: its arm and gripper, and the start of its process.
 
-They are on the board of the process, see ``simulation``; nothing here imports JAX.
+They are on the blackboard of the process, see ``process``; nothing here imports JAX.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from apnpql_jax.errors import DeviceError
-from apnpql_jax.robot.board import Board, text
+from apnpql_jax.robot.blackboard import Blackboard, text
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.orders import comes_true
 from apnpql_jax.robot.protocols import ArmState, GripperState
-from apnpql_jax.robot.simulation import CLOSE, HOLD, OPEN, RECORDS, main
+from apnpql_jax.robot.simulated.process import CLOSE, HOLD, OPEN, RECORDS, main
 
 _START_S = 120.0
 """Time that the plant may take to start, s; a busy machine imports slowly."""
@@ -34,11 +34,11 @@ class _OnBoard:
   def __init__(self, plant: str):
     """Keeps the name of the board."""
     self._name = plant
-    self._board: Board | None = None
+    self._board: Blackboard | None = None
 
   def connect(self) -> None:
     """See ``Device.connect``."""
-    self._board = Board(self._name, RECORDS)
+    self._board = Blackboard(self._name, RECORDS)
 
   def disconnect(self) -> None:
     """See ``Device.disconnect``."""
@@ -131,7 +131,7 @@ def started(
     yield robot
     return
   settings = {"seed": seed, "latency_s": latency_s, "clock": robot.clock}
-  with Board(records=RECORDS) as board:
+  with Blackboard(records=RECORDS) as board:
     process = get_context("spawn").Process(
       target=main, args=(board.name, robot.contract["task"], settings), daemon=True
     )
@@ -155,16 +155,18 @@ def started(
 
 
 @contextlib.contextmanager
-def opened(robot: Robot) -> Generator[Board]:
+def opened(robot: Robot) -> Generator[Blackboard]:
   """Yields the board of a started plant, to place its objects."""
-  with Board(robot.plant, RECORDS) as board:
+  with Blackboard(robot.plant, RECORDS) as board:
     yield board
 
 
 class Operator:
   """What an operator does at a real arm, done to a started plant."""
 
-  def __init__(self, board: Board, wait: Callable[[Callable[[], bool], str], None]):
+  def __init__(
+    self, board: Blackboard, wait: Callable[[Callable[[], bool], str], None]
+  ):
     """Keeps the plant's board; ``wait`` waits for a condition, which has a name."""
     self._board, self._wait = board, wait
     self._scene = 0
@@ -191,7 +193,7 @@ class Operator:
     )
 
 
-def _opened(board: Board | None) -> Board:
+def _opened(board: Blackboard | None) -> Blackboard:
   if board is None:
     raise DeviceError("simulated robot: not connected")
   return board

@@ -10,18 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from apnpql_jax.robot import (
-  check_devices,
-  check_program,
-  policy_process,
-  setup,
-  simulated,
-)
+from apnpql_jax.robot import policy_process, setup
 from apnpql_jax.robot.arm_model import ArmModel
-from apnpql_jax.robot.check_table import Table
+from apnpql_jax.robot.check import devices, program
+from apnpql_jax.robot.check.table import Table
 from apnpql_jax.robot.contact import FILTER_S, stiffness_limit
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.policy_folder import PolicyFolder
+from apnpql_jax.robot.simulated.devices import started
 
 
 def check(
@@ -41,21 +37,21 @@ def check(
   }
   with table.row("calibration"):
     setup.check_calibration(robot)
-  act = check_program.rest
+  act = program.rest
   with table.row("program"):  # First, because simulated cameras need JAX set up.
     act, loaded = policy_process.load_program(policy, seed=0), True
   with contextlib.ExitStack() as stack:
-    robot = stack.enter_context(simulated.started(robot))
-    senses = check_program.Senses(
-      check_devices.arm(stack, table, robot, policy.neutral),
-      check_devices.gripper(stack, table, robot),
-      check_devices.cameras(stack, table, robot),
+    robot = stack.enter_context(started(robot))
+    senses = program.Senses(
+      devices.arm(stack, table, robot, policy.neutral),
+      devices.gripper(stack, table, robot),
+      devices.cameras(stack, table, robot),
     )
     with table.row("program"):
-      seconds, ages = check_program.try_out(act, robot, senses)
+      seconds, ages = program.try_out(act, robot, senses)
       if loaded:
-        check_program.report(table, robot, seconds)
-      check_devices.ages(table, robot, ages)
+        program.report(table, robot, seconds)
+      devices.ages(table, robot, ages)
   table.rows["admittance"] = _contacts(policy, robot) if admittance else "off"
   return table.result()
 

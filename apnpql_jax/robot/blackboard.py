@@ -1,4 +1,4 @@
-"""Records in shared memory, through which the processes of the runtime talk.
+"""A blackboard: records in shared memory, through which the processes talk.
 
 Each record has one writer. A reader takes a copy, and takes another one if its number
 or its checksum shows that the writer was at work. There are no locks, so a process that
@@ -156,11 +156,11 @@ class Record:
     self._body.release()
 
 
-class Board:
+class Blackboard:
   """All records of a run; also a context manager."""
 
   def __init__(self, name: str | None = None, records: Mapping[str, Any] | None = None):
-    """Makes a board, or opens the one with this name; see ``RECORDS``."""
+    """Makes a blackboard, or opens the one with this name; see ``RECORDS``."""
     records = RECORDS if records is None else records
     sizes = {key: Record.size(fields) for key, fields in records.items()}
     memory = shared_memory.SharedMemory(
@@ -190,7 +190,7 @@ class Board:
     """Lets go of the memory, and removes it if this process has made it."""
     self._close()
 
-  def __enter__(self) -> Board:
+  def __enter__(self) -> Blackboard:
     return self
 
   def __exit__(self, *error: object) -> None:

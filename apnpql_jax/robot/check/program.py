@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from apnpql_jax.errors import DeviceError, one_line
-from apnpql_jax.robot.check_table import Table
+from apnpql_jax.robot.check.table import Table
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.player import Act, Observer
 from apnpql_jax.robot.protocols import Frame

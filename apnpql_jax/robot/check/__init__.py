@@ -1,0 +1,1 @@
+"""What `apnpql robot check` reads, tries and shows; nothing moves."""
