@@ -179,10 +179,7 @@ class Session(contextlib.AbstractContextManager):
   def _start(self, robot: Robot, options: Options) -> None:
     if robot.kind == "simulated":
       started = simulated.started(
-        robot,
-        seed=options.seed,
-        latency_s=options.latency_s,
-        watch=self._check_signals,
+        robot, seed=options.seed, latency_s=options.latency_s, watch=self._check_signals
       )
       robot = self._stack.enter_context(started)
       plant = self._stack.enter_context(simulated.opened(robot))
@@ -267,9 +264,8 @@ class Session(contextlib.AbstractContextManager):
     if not comes_true(written, policy_process.END_S):
       self._failure = self._failure or "policy: it does not end its episode"
     found = self.board["policy"].read()
-    if found["order"] == number:
-      return found
-    return dict.fromkeys(("actions", "missed", "solved"), 0) | {"index": -1}
+    none = dict.fromkeys(("actions", "missed", "solved"), 0) | {"index": -1}
+    return found if found["order"] == number else none
 
   def _overruns(self) -> int:
     """Returns how many cycles have been late so far."""
