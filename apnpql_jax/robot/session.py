@@ -130,7 +130,7 @@ class Session(contextlib.AbstractContextManager):
     policy = self._ended(number)
     self._take_events()
     solved = bool(policy["solved"])
-    judged = self._robot.can_judge and whole and policy["actions"]
+    judged = whole and not self._failure and self._robot.can_judge and policy["actions"]
     return Outcome(
       solved=solved if judged else None,
       reason=reason or (SOLVED if solved else TIME_LIMIT),

@@ -168,5 +168,6 @@ def test_a_control_that_hangs_ends_the_session_with_an_unknown_arm(
   assert (found["exit_code"], found["episodes"]) == (3, 1)
   assert found["failure"] == "robot: the arm does not come to rest"
   assert found["arm"] == UNKNOWN
+  assert json.loads((log / EVENTS).read_text())["solved"] is None
   (kept,) = lerobot.read(log).episodes
   assert len(kept.actions) > 3
