@@ -99,9 +99,11 @@ class Env:
     """Number of held-out rows."""
     return self._bank.rows - self.bank_split
 
-  def reset(self, rows: Int[Array, " worlds"]) -> EnvState:
-    """Starts one world per bank row; a row always has the same randomization."""
-    return self.observe(self.begin(rows))
+  def reset(
+    self, rows: Int[Array, " worlds"], keys: PRNGKeyArray | None = None
+  ) -> EnvState:
+    """Starts one world per bank row; see ``begin``."""
+    return self.observe(self.begin(rows, keys))
 
   def step(
     self, state: EnvState, action: Float[Array, "worlds 7"], key: PRNGKeyArray
@@ -109,10 +111,14 @@ class Env:
     """Runs one control period in every world; see ``advance``."""
     return self.observe(self.advance(state, action, key))
 
-  def begin(self, rows: Int[Array, " worlds"]) -> Arrival:
-    """Starts one world per bank row: first half of ``reset``."""
+  def begin(
+    self, rows: Int[Array, " worlds"], keys: PRNGKeyArray | None = None
+  ) -> Arrival:
+    """Starts one world per bank row: first half of ``reset``.
+
+    A key per world draws its randomization. Without keys, a row always has the same.
+    """
     count = rows.shape[0]
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), rows)
     first = Arrival(
       physics=self._initial(rows, keys),
       targets=self._bank.targets[rows],
@@ -146,9 +152,9 @@ class Env:
     state: EnvState,
     action: Float[Array, "worlds 7"],
     rows: Int[Array, " worlds"],
-    keys: PRNGKeyArray,
+    keys: PRNGKeyArray | None,
   ) -> Arrival:
-    """Runs ``advance`` with given resets: a bank row and a key for each world."""
+    """Runs ``advance`` with given resets: ``rows`` and ``keys`` as in ``begin``."""
     physics_step = devices.per_device(self.physics.step, self.mesh)
     moved = physics_step(state.physics, action[:, :6], action[:, 6])
     # Reset worlds whose episode is over or whose state is broken.
@@ -197,9 +203,11 @@ class Env:
     """Repeats L times, [worlds, ...] -> [worlds, L, ...]."""
     return jnp.repeat(x[:, None], self._instants, axis=1)
 
-  def _initial(self, rows: Array, keys: PRNGKeyArray) -> PhysicsState:
+  def _initial(self, rows: Array, keys: PRNGKeyArray | None) -> PhysicsState:
     """Returns worlds at rest at rows of the bank, randomized if configured."""
     bank = self._bank
+    if keys is None:
+      keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), rows)
     drawn = bank.qpos, bank.mocap_pos, bank.mocap_quat, bank.variant
     state = physics.initial_state(self.task.scene, *(x[rows] for x in drawn))
     return state if self._randomize is None else self._randomize(state, keys)
