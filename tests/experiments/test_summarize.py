@@ -6,6 +6,7 @@ import csv
 import json
 import sys
 
+import pytest
 from run_files import make_run
 import summarize
 
@@ -24,3 +25,6 @@ def test_curves_table_and_evaluations_of_each_seed_are_written(tmp_path, monkeyp
   with (out / "seed_1.csv").open() as file:
     rows = list(csv.DictReader(file))
   assert [float(row["eval/success_rate"]) for row in rows] == [0.2, 0.9]
+  sys.argv.append(str(make_run(tmp_path / "other", [0.5], seed=1)))
+  with pytest.raises(SystemExit, match="two runs have the same seed"):
+    summarize.main()
