@@ -30,7 +30,7 @@ class State(struct.PyTreeNode):
   """The state of a world, with the fields of ``brax.envs.State``."""
 
   pipeline_state: EnvState
-  """State of the simulation, with a first axis of one world."""
+  """State of the simulation, ``Env``'s without the axis of worlds."""
 
   obs: dict[str, Array]
   """Fields of ``types.Observation``."""
