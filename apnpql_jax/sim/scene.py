@@ -74,11 +74,12 @@ def load_scene(
   """Compiles an MJCF file that includes the robot, and checks it.
 
   ``cameras`` must exist. Each world has one of the ``variants``: functions that edit
-  the parsed file, such as the shape of an object, but keep its structure.
+  the parsed file, such as the size of an object, but keep its structure.
 
   Raises:
     ConfigError: The file does not compile, lacks a joint, site or camera, uses a
-      feature that MJX would silently ignore, or changes the robot.
+      feature that MJX would silently ignore, or changes the robot; or its variants
+      differ in what all worlds share.
   """
   models = [compile_file(path, edit) for edit in variants or [lambda _: None]]
   model = models[0]
@@ -87,6 +88,7 @@ def load_scene(
   finger = _named_id(model, path.stem, "joint", GRIPPER_JOINT)
   for camera in cameras:
     _named_id(model, path.stem, "camera", camera)
+  scene_checks.check_variants(models, path.stem)
   for variant in models:
     scene_checks.check_robot(variant, path.stem)
     scene_checks.check_keyframes(variant, path.stem)
