@@ -111,6 +111,11 @@ def free_joints(model: mujoco.MjModel) -> np.ndarray:
   return np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
 
 
+def fixed_bodies(model: mujoco.MjModel) -> np.ndarray:
+  """Returns a mask bool[nbody] of the world and of the bodies without joints to it."""
+  return model.body_weldid == 0
+
+
 def _named_id(model: mujoco.MjModel, scene: str, kind: str, name: str) -> int:
   short = {"joint": "jnt", "camera": "cam"}.get(kind, kind)
   accessor = getattr(model, short)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import copy
 import dataclasses
 
+from hand_made import randomized
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
+from apnpql_jax.config.files import mjcf_path
 from apnpql_jax.config.ranges import RandomizationConfig
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.envs.env import Env, make_env
@@ -19,6 +21,7 @@ from apnpql_jax.randomization.draw import free_bodies
 from apnpql_jax.randomization.randomize import make_randomize
 from apnpql_jax.sim import arm, engines, motors, physics
 from apnpql_jax.sim.kinematics import make_kinematics
+from apnpql_jax.sim.scene import load_scene
 from apnpql_jax.tasks import make_task, task_names
 from apnpql_jax.training.rollout import FILMED, expert_policy, make_player
 
@@ -149,6 +152,19 @@ def test_each_camera_shifts_within_its_own_range(task, drawn, camera, share):
   shift = drawn.fields["cam_pos"][:, index] - task.scene.model.cam_pos[index]
   limit = share * ALL.camera_shift
   assert 0.5 * limit < np.abs(shift).max() <= 1.001 * limit
+
+
+def test_a_camera_on_a_stand_shifts_as_one_in_the_world():
+  def add(spec: mujoco.MjSpec) -> None:
+    tripod = spec.worldbody.add_body(name="tripod", pos=[0.0, 1.0, 0.5]).add_body()
+    tripod.add_camera(name="side")
+
+  scene = load_scene(mjcf_path("push_plate"), variants=[add])
+  config = dataclasses.replace(NONE, camera_shift=ALL.camera_shift)
+  shift = np.abs(
+    randomized(scene, config).fields["cam_pos"][:, scene.id("camera", "side")]
+  )
+  assert 0.5 * ALL.camera_shift < shift.max() <= 1.001 * ALL.camera_shift
 
 
 def test_inertia_is_proportional_to_mass(task):
