@@ -9,12 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 import dataclasses
 import hashlib
+import operator
 import pathlib
 import warnings
 
 import mujoco
 import numpy as np
 
+from apnpql_jax.colors import geom_rgba
 from apnpql_jax.config import files
 from apnpql_jax.console import print_line
 from apnpql_jax.errors import ConfigError, one_line
@@ -171,7 +173,8 @@ def _differences(models: Sequence[mujoco.MjModel]) -> dict[str, np.ndarray]:
     value = getattr(models[0], field.name, None)
     if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
       continue
-    values = np.stack([getattr(model, field.name) for model in models])
+    shown = geom_rgba if field.name == "geom_rgba" else operator.attrgetter(field.name)
+    values = np.stack([shown(model) for model in models])
     if (values != values[0]).any():
       differences[field.name] = values.astype(np.float32)
   return differences
