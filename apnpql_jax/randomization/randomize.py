@@ -34,7 +34,12 @@ Randomize = Callable[[PhysicsState, Array], PhysicsState]  # of states at rest a
 
 
 def make_randomize(config: RandomizationConfig, scene: Scene) -> Randomize:
-  """Returns the function that draws a world for each episode."""
+  """Returns the function that draws a world for each episode.
+
+  Raises:
+    ConfigError: The objects of the scene cannot change as ``config`` says.
+  """
+  objects.check(config, scene)
 
   def one(state: PhysicsState, key: PRNGKeyArray) -> PhysicsState:
     draw, world = Draw(key, config), World(scene.model, state.fields)
