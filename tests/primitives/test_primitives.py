@@ -15,6 +15,7 @@ from typing import Any
 from hand_made import SLOW_MJX
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -23,6 +24,7 @@ from apnpql_jax.errors import UserError
 from apnpql_jax.primitives import ik, reset_bank, tracking
 from apnpql_jax.sim import arm, physics
 from apnpql_jax.sim.kinematics import make_kinematics
+from apnpql_jax.sim.scene import load_scene
 from apnpql_jax.tasks.stack_box import StackBox
 from apnpql_jax.tasks.task import ResetDraw
 
@@ -116,8 +118,11 @@ def test_bank_rejects_overlapping_and_unreachable_draws(capsys):
 
 @pytest.mark.parametrize("timestep", [0.0025, 0.005])
 def test_draws_settle_for_four_control_periods(timestep):
+  def edit(spec: mujoco.MjSpec) -> None:
+    spec.option.timestep = timestep
+
   careless = Careless()
-  careless.scene.model.opt.timestep = timestep
+  careless.scene = load_scene(careless.scene.path, variants=[edit])
   state, _ = reset_bank._settled(
     careless, np.random.default_rng(0), 3, reset_bank.BankReport()
   )
