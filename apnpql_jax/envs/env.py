@@ -306,6 +306,8 @@ def make_env(
   _substeps(config, task.scene)
   if config.obs == "pixels":
     make_cameras(config, task.scene)
+  if config.randomize:
+    make_randomize(config.randomization, task.scene)
   bank, _ = reset_bank.load_bank(task, config.bank_rows, seed=bank_seed)
   return Env(config, task, bank, mesh, instants=instants, imitated=imitated)
 
