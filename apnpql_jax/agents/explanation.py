@@ -44,7 +44,8 @@ class Explanation(struct.PyTreeNode):
   """Its Q."""
 
   primitives: Float[Array, "*b 3 7"]
-  """Predicted action primitives: joint velocities in rad/s, logit of closing."""
+  """Predicted action primitives: joint velocities in rad/s, logit of closing. With
+  ``env.true_primitives`` the prior has the true ones instead."""
 
   candidates: Float[Array, " s *b 7"]
   """Candidates, clipped to the action box. For ap_npql and rows that project by the
