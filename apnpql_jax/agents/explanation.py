@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 from flax import struct
@@ -75,9 +74,9 @@ class Explanation(struct.PyTreeNode):
 
     def picked(node: Any) -> dict[str, Any]:
       return {
-        field.name: x[:, state] if field.name in sampled else x[state]
-        for field in dataclasses.fields(node)
-        if isinstance(x := getattr(node, field.name), jax.Array)
+        name: x[:, state] if name in sampled else x[state]
+        for name, x in vars(node).items()
+        if name != "prior"
       }
 
     prior = self.prior and self.prior.replace(**picked(self.prior))
