@@ -209,7 +209,7 @@ def test_losses_are_those_of_the_candidates_that_the_row_names(name: str):
     expected["loss/policy"] = {"forward": forward, "reverse": reverse}[columns.kl]
   if columns.fitted_to == "good":
     # By draws of its own, not those of the policy update.
-    key = jax.random.fold_in(KEY, 1)
+    key = jax.random.fold_in(KEY, 2)
     candidates["good"] = of_good(heads, example.batch.action_tm1, key)
   if columns.fitted_to == "expert":
     assert example.batch.expert_tm1 is not None
