@@ -1,4 +1,4 @@
-"""Documents: the files, modules and tests that they name exist."""
+"""Documents: files, modules and tests that they name exist, and lists are complete."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from pathlib import Path
 import re
 
 import pytest
+
+from apnpql_jax.doctor.software import EXTRAS
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted(
@@ -54,3 +56,33 @@ def test_tests_that_documents_name_exist():
   for document in DOCUMENTS:
     named = set(re.findall(r"`(?:tests/[\w/]*)?(test_\w+)", document.read_text()))
     assert named <= known, document
+
+
+def test_the_index_of_decisions_has_each_decision_with_its_date():
+  folder = ROOT / "docs" / "decisions"
+  index = (folder / "index.md").read_text()
+  for topic in sorted({*folder.glob("*.md")} - {folder / "index.md"}):
+    entries = re.findall(rf"^- (\S+) \[(.+)\]\({topic.name}#", index, re.M)
+    decisions = re.findall(r"^## (.+)\n\n([\d-]*)", topic.read_text(), re.M)
+    assert entries == [(date, heading) for heading, date in decisions], topic
+
+
+def test_the_table_of_benchmarks_has_each_module_that_is_run():
+  folder = ROOT / "benchmarks"
+  scripts = {
+    f"{path.parent.name}.{path.stem}"
+    for path in folder.glob("*/*.py")
+    if "__main__" in path.read_text()
+  }
+  rows = re.findall(r"^\| (`.+?) \|", (folder / "README.md").read_text(), re.M)
+  named = re.findall(r"`([\w.]+)`", " ".join(rows))
+  # A comparison starts the processes of its sides itself.
+  assert sorted(named) == sorted(scripts - {"peers.sides"})
+
+
+def test_the_table_of_extras_is_that_of_the_doctor():
+  """``tests/doctor/test_doctor.py`` compares that with pyproject.toml."""
+  text = (ROOT / "docs" / "command_line.md").read_text()
+  table = text.partition("## Extras")[2].partition("##")[0]
+  rows = re.findall(r"^\| `(\w+)` \| (.+?)(?: \(.+\))? \|$", table, re.M)
+  assert {extra: gives.replace("`", "") for extra, gives in rows} == EXTRAS

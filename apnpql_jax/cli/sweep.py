@@ -16,7 +16,9 @@ from apnpql_jax.config import files
 from apnpql_jax.config.checks import validate
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import ConfigError, UserError
+from apnpql_jax.reports.groups import differences
 from apnpql_jax.runs import run_folder
+from apnpql_jax.runs.sinks import check_sinks
 from apnpql_jax.sweeps import manifest as states
 from apnpql_jax.sweeps.manifest import Manifest
 from apnpql_jax.sweeps.plan import Planned, make_plan
@@ -114,7 +116,7 @@ def config_of(argv: Sequence[str]) -> TrainConfig:
 def _open(args: Sweep, stack: contextlib.ExitStack) -> Manifest:
   """Returns the sweep to continue, or a new one."""
   if args.resume is not None:
-    if args.presets or args.grid or args.train or args.out:
+    if args.presets or args.grid or args.train or args.out or args.seeds != 1:
       raise ConfigError("--resume names the sweep itself; give only --jobs, --launcher")
     return states.load(args.resume)
   if not args.presets:
@@ -128,7 +130,27 @@ def _open(args: Sweep, stack: contextlib.ExitStack) -> Manifest:
     stems = (Path(preset).stem for preset in args.presets)
     name = f"{'-'.join(stems)}-sweep"
     folder = stack.enter_context(run_folder.new_run_dir(name, _ROOT))
-  return states.open_folder(folder, plan)
+  manifest = states.open_folder(folder, plan)
+  check_begun(manifest)
+  return manifest
+
+
+def check_begun(manifest: Manifest) -> None:
+  """Checks that runs which have begun have the settings that they would begin with.
+
+  Raises:
+    ConfigError: The preset of a run has changed.
+  """
+  for entry in manifest.runs:
+    run_dir = manifest.run_dir(entry)
+    if not (run_dir / run_folder.CONFIG_FILE).is_file():
+      continue
+    began = run_folder.load_run_config(run_dir)
+    if diff := differences(began, config_of(entry.argv)):
+      raise ConfigError(
+        f"{run_dir} began with other settings: {files.format_diff(diff)}; remove it to "
+        "train it again, or choose another --out"
+      )
 
 
 def _check(run: Planned) -> None:
@@ -137,7 +159,7 @@ def _check(run: Planned) -> None:
   if found := fixed & {word.partition("=")[0] for word in run.argv}:
     raise ConfigError(f"leave out {', '.join(sorted(found))}; the sweep sets it itself")
   try:
-    config_of(run.argv)
+    check_sinks(config_of(run.argv).sinks)
   except UserError as error:
     raise ConfigError(f"{run.name}: {error}") from None
 

@@ -8,13 +8,12 @@ from typing import Any, NamedTuple
 
 from apnpql_jax.config import codec
 from apnpql_jax.config.changes import REPORTS
+from apnpql_jax.config.files import config_diff
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.reports.reading import Run
 
-IGNORED = (
-  "seed eval_every checkpoint_every keep_checkpoints save_replay_every "
-  "max_skipped_updates video sinks wandb_project wandb_entity wandb_id"
-).split()
+_RESULTS = "total_steps", "eval_episodes", "eval_acting"  # that change what is compared
+IGNORED = ("seed", *(name for name in REPORTS if name not in _RESULTS))
 """Settings that do not put runs into different groups."""
 
 TASK = "env.task"
@@ -52,6 +51,12 @@ def group(runs: Sequence[Run]) -> list[Group]:
     labels = _labels(members)
     found += [Group(task, *pair) for pair in zip(labels, members, strict=True)]
   return found
+
+
+def differences(old: TrainConfig, new: TrainConfig) -> dict[str, tuple[Any, Any]]:
+  """Returns dotted name -> (old, new) of the settings that make another group."""
+  diff = config_diff(old, new)
+  return {name: pair for name, pair in diff.items() if name not in IGNORED}
 
 
 def settings(config: TrainConfig) -> Settings:

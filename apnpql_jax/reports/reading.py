@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 import dataclasses
 import json
 from pathlib import Path
+import sys
 from typing import Any
 
 from apnpql_jax.config.schema import TrainConfig
@@ -96,11 +97,12 @@ def read(folder: Path) -> Run:
   Raises:
     FileError: It is not a run folder, or one of its files cannot be read.
   """
+  evaluations = read_evaluations(folder)
   return Run(
     folder.resolve().name,
     load_run_config(folder),
-    read_evaluations(folder),
-    _json(folder / EVALUATION_FILE),
+    evaluations,
+    _final(folder / EVALUATION_FILE, evaluations),
     _json(folder / "versions.json") or {},
     folder,
   )
@@ -110,6 +112,21 @@ def is_finished(folder: Path, config: TrainConfig) -> bool:
   """Returns whether a run folder holds a checkpoint of the last step."""
   names = (path.name for path in (folder / "checkpoints").glob("*"))
   return any(int(x) >= config.total_steps for x in names if x.isdecimal())
+
+
+def _final(path: Path, evaluations: Sequence[Row]) -> dict[str, Any] | None:
+  """Returns the evaluation in a file, unless the run was evaluated later."""
+  if (data := _json(path)) is None:
+    return None
+  try:
+    float(data["success_rate"]), int(data["episodes"])
+    step = int(data.get("checkpoint_step", sys.maxsize))
+  except (LookupError, ValueError, TypeError):
+    raise FileError(f"{path} is not what `apnpql evaluate --json` prints") from None
+  if evaluations and step < (evaluations[-1][STEP] or 0.0):
+    print_line(f"left out: {path} is from step {step:,}, before the last evaluation")
+    return None
+  return data
 
 
 def _json(path: Path) -> dict[str, Any] | None:

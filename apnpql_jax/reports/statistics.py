@@ -73,22 +73,23 @@ def curve(runs: Sequence[Run], axis: str, *, band: str = "interval") -> Curve:
 
 
 def last(runs: Sequence[Run]) -> Interval:
-  """Returns the success after training, with the interval of ``interval``.
-
-  It is that of the evaluation after training if all runs have one, and otherwise that
-  of the last evaluation during training.
-  """
-  counts = [solved(run) for run in runs]
+  """Returns the success in ``solved``, with the interval of ``interval``."""
+  counts = solved(runs)
   rates = np.array([[rate] for rate, _ in counts])
   low, high = interval(rates, np.array([sum(episodes for _, episodes in counts)]))
   return Interval(float(rates.mean()), float(low[0]), float(high[0]))
 
 
-def solved(run: Run) -> tuple[float, int]:
-  """Returns rate and number of episodes of the final or else the last evaluation."""
-  if run.final is not None:
-    return float(run.final["success_rate"]), int(run.final["episodes"])
-  return run.rates[-1], run.episodes[-1]
+def solved(runs: Sequence[Run]) -> list[tuple[float, int]]:
+  """Returns the success rate of each run and the number of episodes.
+
+  They are those of the evaluation after training if all runs have one, and otherwise
+  those of the last evaluation during training.
+  """
+  finals = [run.final for run in runs if run.final is not None]
+  if len(finals) == len(runs):
+    return [(float(x["success_rate"]), int(x["episodes"])) for x in finals]
+  return [(run.rates[-1], run.episodes[-1]) for run in runs]
 
 
 def first_at(run: Run, goal: float, axis: str) -> float | None:

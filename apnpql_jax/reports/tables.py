@@ -41,7 +41,7 @@ def of_groups(groups: Sequence[Group]) -> Rows:
       continue
     rows.append(
       row
-      + [str(statistics.last(runs)), listed(map(solved, runs))]
+      + [str(statistics.last(runs)), solved(runs)]
       + [listed(to_goal(run, axis) for run in runs) for axis in statistics.AXES]
       + [listed(dict.fromkeys(f"{run.steps[-1]:,.0f}" for run in runs))]
       + [listed(f"{run.minutes[-1]:.1f}" for run in runs)]
@@ -72,7 +72,7 @@ def of_runs(groups: Sequence[Group]) -> Rows:
       if run.evaluations:
         minutes, steps = run.minutes[-1], run.steps[-1]
         row += [to_goal(run, "minutes"), f"{minutes:.1f}", f"{steps:,.0f}"]
-        row += [solved(run), str(statistics.last([run]))]
+        row += [solved([run]), str(statistics.last([run]))]
       else:
         row += ["no evaluation yet", *["-"] * 4]
       rows.append(row)
@@ -132,10 +132,12 @@ def listed(values: Iterable[object]) -> str:
   return ", ".join(map(str, values))
 
 
-def solved(run: Run) -> str:
-  """Returns such as ``62 of 64``, or percent if the episodes are not known."""
-  rate, episodes = statistics.solved(run)
-  return f"{rate * episodes:.0f} of {episodes}" if episodes else f"{100 * rate:.0f} %"
+def solved(runs: Sequence[Run]) -> str:
+  """Returns such as ``62 of 64, 60 of 64``; percent if episodes are not known."""
+  return listed(
+    f"{rate * episodes:.0f} of {episodes}" if episodes else f"{100 * rate:.0f} %"
+    for rate, episodes in statistics.solved(runs)
+  )
 
 
 def to_goal(run: Run, axis: str) -> str:

@@ -40,13 +40,20 @@ def latest_step(run_dir: Path) -> int | None:
   return max(all_steps(run_dir), default=None)
 
 
-def best_step(run_dir: Path) -> int | None:
-  """Returns the step with the highest success rate; None if none was evaluated.
+def best_step(run_dir: Path) -> int:
+  """Returns the step with the highest success rate; of equal rates the newest wins.
 
-  Of equal rates the newest wins.
+  Raises:
+    FileError: No checkpoint was evaluated in the iteration that saved it.
   """
   records = checkpoint_record.read_all(run_dir)
-  return best({step: record.success_rate for step, record in records.items()})
+  found = best({step: record.success_rate for step, record in records.items()})
+  if found is None:
+    raise FileError(
+      f"no checkpoint of {str(run_dir)!r} has a success rate, because none was saved "
+      "together with an evaluation; choose the newest or a step"
+    )
+  return found
 
 
 def restore(

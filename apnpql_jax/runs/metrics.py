@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 import json
 import math
 from pathlib import Path
+import shutil
 import time
 from typing import Any, Protocol
 
@@ -70,10 +71,8 @@ class MetricWriter:
   ):
     """Opens the file and keeps its rows, except those after ``resume_step``.
 
-    The sinks are closed together with this writer.
-
-    Raises:
-      FileError: A row cannot be read.
+    Lines that cannot be read are left out, and a copy of the file is kept. The sinks
+    are closed together with this writer.
     """
     self._path = run_dir / "metrics.jsonl"
     self._sinks, self._clock, self._max_bytes = list(sinks), clock, max_bytes
@@ -117,7 +116,7 @@ class MetricWriter:
 
     That file becomes ``metrics.jsonl`` again.
     """
-    rows = read_rows(self._path)
+    rows = self._readable()
     if step is None:
       return rows
     kept = [row for row in rows if (row[STEP] or 0) <= step]
@@ -125,6 +124,16 @@ class MetricWriter:
       _numbered(self._path, number).replace(self._path)
       return self._rows_until(step)
     return kept
+
+  def _readable(self) -> list[Row]:
+    """Returns the rows of the file that can be read; keeps a copy if some cannot."""
+    try:
+      return read_rows(self._path)
+    except FileError as error:
+      copy = self._path.with_suffix(".damaged.jsonl")
+      shutil.copyfile(self._path, copy)
+      print_line(f"{error}; left out, and the whole file is kept as {copy.name}")
+      return read_rows(self._path, skip_damaged=True)
 
 
 def metric_files(run_dir: Path) -> list[Path]:
@@ -146,14 +155,15 @@ def _numbered(path: Path, number: int) -> Path:
   return path.with_suffix(f".{number}{path.suffix}")
 
 
-def read_rows(path: Path, *, having: str = "") -> list[Row]:
+def read_rows(path: Path, *, having: str = "", skip_damaged: bool = False) -> list[Row]:
   """Returns the rows of a metric file, oldest first; none if there is no file.
 
   Skips lines without the text ``having``, so that the few evaluations of a long run are
   read without parsing all of its rows.
 
   Raises:
-    FileError: A line other than an incomplete last one is not a row.
+    FileError: A line other than an incomplete last one is not a row, and
+      ``skip_damaged`` is not set.
   """
   if not path.exists():
     return []
@@ -168,6 +178,8 @@ def read_rows(path: Path, *, having: str = "") -> list[Row]:
         row = json.loads(line)
         row[STEP] + 0
       except (ValueError, TypeError, KeyError):
+        if skip_damaged:
+          continue
         raise FileError(f"{path}, line {number}: not a row of metrics") from None
       rows.append(row)
   return rows

@@ -79,8 +79,8 @@ def changed_task(run_dir: Path, task_file: Path) -> bool:
 
   False if the record cannot be read, which ``changed_versions`` reports.
   """
-  record = read(run_dir)
-  return bool(record) and record.get("task_file") != user_files.digest(task_file)
+  recorded = (read(run_dir) or {}).get("task_file")  # None: the file has only a preset.
+  return recorded not in (None, user_files.digest(task_file))
 
 
 def describe_versions(devices: int, task_file: str = "") -> dict[str, Any]:

@@ -99,6 +99,8 @@ def open_run(run_dir: Path) -> RunFolder:
     for path in (Path(folder, name) for name in folders + names):
       if path.is_symlink() and not path.resolve().is_relative_to(inside):
         raise FileError(f"{path} is a link that leads out of the run folder")
+    if Path(folder) == run_dir and "wandb" in folders:
+      folders.remove("wandb")  # There, wandb links to its own logs elsewhere.
   return RunFolder(run_dir.absolute(), load_run_config(run_dir))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 import sys
 from typing import NamedTuple, Protocol
@@ -21,12 +22,19 @@ class Work(NamedTuple):
   def command(self) -> list[str]:
     """Returns the command that starts the run, or resumes it if it has begun."""
     run_dir = str(self.run_dir)
-    begun = (self.run_dir / CONFIG_FILE).is_file()
-    rest = ["--resume", run_dir] if begun else [*self.argv, "--run", run_dir]
-    preset = self.argv[0] if self.argv else ""
-    if begun and user_files.is_file(preset):
-      rest += ["--task-file", preset]
+    rest = [*self.argv, "--run", run_dir]
+    if (self.run_dir / CONFIG_FILE).is_file():
+      rest = ["--resume", run_dir, *self._not_stored()]
     return [sys.executable, "-m", "apnpql_jax", "train", *rest]
+
+  def _not_stored(self) -> list[str]:
+    """Returns the options that no run stores, so that a resume needs them again."""
+    preset = self.argv[0] if self.argv else ""
+    options = ["--task-file", preset] if user_files.is_file(preset) else []
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--devices")
+    devices = parser.parse_known_args(self.argv)[0].devices
+    return options if devices is None else [*options, "--devices", devices]
 
 
 class Job(Protocol):

@@ -8,7 +8,7 @@ from pathlib import Path
 import re
 from typing import NamedTuple
 
-from apnpql_jax.config import codec
+from apnpql_jax.config import codec, user_files
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import ConfigError
 
@@ -48,6 +48,9 @@ def make_plan(
   """
   axes = [parse_axis(text) for text in grid]
   names = [axis.option for axis in axes]
+  given = {_name(word) for word in options if word.startswith("--")}
+  if twice := sorted(given & {"seed", *names}):
+    raise ConfigError(f"give {', '.join(twice)} by --grid {twice[0]}=... alone")
   if repeated := sorted({name for name in names if names.count(name) > 1}):
     raise ConfigError(f"--grid has {', '.join(repeated)} twice; list all values once")
   if "seed" not in names:
@@ -77,17 +80,25 @@ def parse_axis(text: str) -> Axis:
     ConfigError: It is not written like that.
   """
   option, equals, values = text.partition("=")
-  option = option.strip().lstrip("-").replace("-", "_")
+  option = _name(option)
   found = [value.strip() for value in values.split(",")]
   if not equals or not option or not all(found):
     raise ConfigError(f"--grid {text!r} is not like agent.epsilon=0.5,1,2")
   return Axis(option, found)
 
 
+def _name(option: str) -> str:
+  """Returns the name of a setting in ``--agent.n-step=2``, or without its value."""
+  return option.partition("=")[0].strip().lstrip("-").replace("-", "_")
+
+
 def _run(
   preset: str, chosen: Sequence[tuple[Axis, str]], options: Sequence[str]
 ) -> Planned:
-  name, argv = [_plain(Path(preset).stem)], [preset, *options]
+  name = [_plain(Path(preset).stem)]
+  # A sweep may be continued from another folder.
+  path = str(Path(preset).resolve()) if user_files.is_file(preset) else preset
+  argv = [path, *options]
   for axis, value in chosen:
     short = axis.option.rpartition(".")[2]
     name.append(_plain(f"{short}_{value}"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 import time
 
+from apnpql_jax.console import reporting
 from apnpql_jax.errors import INTERRUPTED, UserError, one_line
 from apnpql_jax.runs import run_folder
 from apnpql_jax.sweeps import manifest as states
@@ -48,7 +49,7 @@ class Runner:
         self._collect()
         show()
         time.sleep(_POLL_S)
-      self._manifest.save()
+      self._save()
 
   def _waiting(self) -> list[Entry]:
     return [entry for entry in self._manifest.runs if entry.state == states.WAITING]
@@ -93,5 +94,10 @@ class Runner:
 
   def _change(self, entry: Entry, state: str) -> None:
     entry.state = state
-    self._manifest.save()
+    self._save()
     self._report(entry)
+
+  def _save(self) -> None:
+    """Saves the manifest if the disk permits; the run folders know what is done."""
+    with reporting("save the manifest"):
+      self._manifest.save()

@@ -5,8 +5,8 @@
 Each peer is set up as its users would, see ``PEERS``, in processes of its own. So is
 this project. Both are timed in turns, round by round. A ratio is ours over theirs of
 one round; the report has the median over the rounds with the lowest and the highest.
-Peers that are not installed (``pip install -e '.[peers]'``) or do not answer in time
-are reported as missing.
+Peers that are not installed (``.venv/bin/pip install -e '.[peers]'``) or do not answer
+in time are reported as missing.
 """
 
 import argparse

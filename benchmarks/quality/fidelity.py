@@ -2,9 +2,10 @@
 
   python -m benchmarks.quality.fidelity --store
 
-Compares segmentation and depth of both cameras. ``--store`` also writes the worst image
-of every scene to docs/images/fidelity.png: our image, our segmentation, MuJoCo's, and
-their difference. Where MuJoCo cannot draw, its rays replace its rasterizer.
+Compares segmentation and depth of both cameras. ``--store`` also writes the worst
+global image of every scene to docs/images/fidelity.png: our image, our segmentation,
+MuJoCo's, and their difference. Where MuJoCo cannot draw, its rays replace its
+rasterizer.
 """
 
 from collections.abc import Iterator

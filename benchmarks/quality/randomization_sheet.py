@@ -22,7 +22,7 @@ from benchmarks.common import store
 
 OUT = store.ROOT / "docs" / "images" / "randomization.png"
 LOOKS: dict[str, Any] = {"global_size": (144, 192), "wrist_size": (72, 128)}
-LOOKS |= {"shadows": True, "randomize": True, "backend": "native"}
+LOOKS |= {"randomize": True, "backend": "native"}
 WORLDS, PERIODS, GAP = 6, 12, 4
 """Worlds of a task, periods that the expert plays, white pixels between tiles."""
 

@@ -18,23 +18,27 @@ import sys
 from typing import Any, NamedTuple
 
 from apnpql_jax.atomic import replacing
-from apnpql_jax.cli.sweep import config_of as config_of_options
-from apnpql_jax.config.files import config_diff, config_from_json, format_diff
+from apnpql_jax.cli.sweep import check_begun, config_of as config_of_options
+from apnpql_jax.config.files import config_from_json, format_diff
 from apnpql_jax.config.schema import TrainConfig
-from apnpql_jax.errors import FAILED, RunStopped
+from apnpql_jax.errors import FAILED, RunStopped, UserError
 from apnpql_jax.reports import figure, statistics, tables
-from apnpql_jax.reports.groups import IGNORED, Group
+from apnpql_jax.reports.groups import Group, differences
 from apnpql_jax.reports.reading import Run
-from apnpql_jax.runs.metrics import read_rows
-from apnpql_jax.sweeps import manifest, training
+from apnpql_jax.runs.metrics import metric_files, read_rows
+from apnpql_jax.sweeps import training
 from apnpql_jax.sweeps.local import LocalLauncher
+from apnpql_jax.sweeps.manifest import DONE, Manifest
 from apnpql_jax.sweeps.plan import Planned
 
 TASKS = ("push_plate", "stack_box", "flip_cup", "place_plate")
 PAPER = ("ap_npql", "ap_mpo", "ap_sac", "sac")
 """Rows of the paper's Fig. 5, which have equal budgets."""
 
-KEPT = ("loss/", "npql/", "prior/", "policy/", "q/", "ap/", "grad_norm/", "faults/")
+KEPT = (
+  *("loss/", "npql/", "prior/", "policy/", "q/", "ap/", "grad_norm/", "faults/"),
+  "time/updates_per_s",
+)
 """Prefixes of the training metrics that are stored with each evaluation."""
 
 Result = dict[str, Any]
@@ -103,15 +107,19 @@ class Comparison:
     plan = [
       Planned(self.path_of(*run).stem, [run[0], *self.options(*run)]) for run in runs
     ]
-    sweep = manifest.open_folder(self.sweep, plan)
+    sweep = Manifest(self.sweep.absolute(), [])  # Only these, not all in its folder.
+    sweep.add(plan)
     failure = ""
     try:
+      check_begun(sweep)
       training.train(sweep, LocalLauncher(jobs))
+    except UserError as error:
+      sys.exit(str(error))
     except RunStopped as stop:
       failure = str(stop)
       if stop.code != FAILED:
         sys.exit(failure)
-    done = {entry.name for entry in sweep.runs if entry.state == manifest.DONE}
+    done = {entry.name for entry in sweep.runs if entry.state == DONE}
     for run in runs:
       if self.path_of(*run).stem in done:
         self.write_result(*run)
@@ -153,9 +161,7 @@ class Comparison:
       for path in sorted(self.out.glob(f"{task}-{row}-*.json")):
         result = json.loads(path.read_text())
         was = config_from_json(json.dumps(result["config"]))
-        diff = config_diff(was, self.config_of(task, row, was.seed))
-        # Presets may save at other times, for instance.
-        if changed := {name: x for name, x in diff.items() if name not in IGNORED}:
+        if changed := differences(was, self.config_of(task, row, was.seed)):
           sys.exit(f"{path.name}: {format_diff(changed)}; remove it to train it again")
         found.setdefault((task, row), []).append(result)
     return found
@@ -214,7 +220,8 @@ class Comparison:
 def evaluations(run: Path) -> list[dict[str, Any]]:
   """Returns the held-out evaluations, each with the training metrics before it."""
   found, last = [], {}
-  for row in read_rows(run / "metrics.jsonl"):
+  rows = (row for path in metric_files(run) for row in read_rows(path))
+  for row in rows:
     last |= {name: x for name, x in row.items() if name.startswith(KEPT)}
     if "eval/success_rate" in row:
       names = ("step", "time/wall_s", "eval/success_rate", "eval/episodes")

@@ -24,11 +24,14 @@ def main() -> None:
   """Runs the command line: OUT RUN [RUN ...]."""
   out, *paths = map(Path, sys.argv[1:])
   found = groups.group(reading.find(paths))
+  runs = [run for group in found for run in group.runs]
+  if len({run.config.seed for run in runs}) < len(runs):
+    sys.exit("two runs have the same seed; write them to different folders")
   out.mkdir(parents=True, exist_ok=True)
   figure.save(found, out / "curves.png")
   text = tables.markdown(tables.of_runs(found))
   (out / "table.md").write_text(text + "\n")
-  for run in (run for group in found for run in group.runs):
+  for run in runs:
     with (out / f"seed_{run.config.seed}.csv").open("w", newline="") as file:
       table = csv.DictWriter(file, COLUMNS, extrasaction="ignore")
       table.writeheader()

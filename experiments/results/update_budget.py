@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import dataclasses
+from statistics import median
 from typing import NamedTuple
 
 from comparison import Found, Result, Row, as_run
@@ -71,7 +72,7 @@ COMPARISON = dataclasses.replace(
 
 
 class Time(NamedTuple):
-  """Minutes of a run until its goal, or until its end without it."""
+  """Minutes of updates and rollouts until the goal, or until the end without it."""
 
   minutes: float
   reached: bool
@@ -81,10 +82,17 @@ class Time(NamedTuple):
 
 
 def time_of(result: Result) -> Time:
-  """Returns the minutes of a run to the goal."""
+  """Returns the minutes of a run to the goal at its median speed.
+
+  Evaluations take no part, nor does other work on the machine that disturbs less than
+  half of the run.
+  """
   run = as_run(result)
-  found = first_at(run, GOAL, "minutes")
-  return Time(run.minutes[-1], False) if found is None else Time(found, True)
+  speed = median(row["time/updates_per_s"] or 0.0 for row in run.evaluations)
+  steps = first_at(run, GOAL, "steps")
+  share = (steps or run.steps[-1]) / run.config.total_steps
+  updates = share * UPDATES[run.config.env.task]
+  return Time(updates / speed / 60, steps is not None)
 
 
 def effects(tasks: Sequence[str], found: Found) -> str:

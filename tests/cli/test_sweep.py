@@ -55,12 +55,12 @@ def test_one_failure_costs_the_others_nothing_and_is_retried(launcher, tmp_path)
   assert "unknown agent.algorithm 'nope'" in bad.line and bad.line in messages
   assert reading.read(found.run_dir(good)).finished
   assert "0 of 4" in (folder / f"{good.name}.log").read_text()
-  code, messages, found = sweep(folder, "--resume", str(folder), *grid[2:])
+  code, messages, found = sweep(folder, *line)
   assert code == 3 and [entry.attempts for entry in found.runs] == [2, 1]
 
 
 @pytest.mark.slow
-def test_ctrl_c_saves_the_runs_and_the_same_command_continues(tmp_path):
+def test_ctrl_c_saves_the_runs_and_a_resume_continues(tmp_path):
   folder = tmp_path / "runs" / "push_plate-sweep-1"
   line = ["push_plate", "--seeds", "2", *testing.TINY_ARGS, "--total-steps", "100000"]
   process = start(folder.parent, *line)
@@ -82,7 +82,7 @@ def test_ctrl_c_saves_the_runs_and_the_same_command_continues(tmp_path):
   done = max(int(x.name) for x in checkpoints.iterdir() if x.name.isdecimal())
   data = json.loads(config.read_text()) | {"total_steps": done + testing.STEPS}
   config.write_text(json.dumps(data))
-  process = start(folder.parent, *line)
+  process = start(folder.parent, "--resume", str(folder))
   while states.load(folder).runs[0].state != states.DONE:
     assert process.poll() is None, process.communicate()
     time.sleep(0.1)

@@ -128,9 +128,15 @@ def test_links_must_not_lead_out_of_a_run_folder(tmp_path: Path):
   outside.mkdir()
   run = run_folder.create(tmp_path / "run", TrainConfig()).path
   (run / "inside").symlink_to(run / "config.json")
+  (run / "wandb").mkdir()
+  (run / "wandb" / "debug-core.log").symlink_to(outside / "log")  # As wandb does.
   run_folder.open_run(run)
   (run / "checkpoints").symlink_to(outside)
   with pytest.raises(UserError, match="checkpoints is a link that leads out"):
+    run_folder.open_run(run)
+  (run / "checkpoints").unlink()
+  (run / "wandb").rename(run / "videos")
+  with pytest.raises(UserError, match="debug-core.log is a link that leads out"):
     run_folder.open_run(run)
 
 

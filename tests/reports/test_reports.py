@@ -148,7 +148,22 @@ def test_the_evaluation_after_training_counts_instead_of_the_last_one(tmp_path):
   final = {"success_rate": 0.75, "episodes": 200, "successes": 150}
   (folder / "evaluation.json").write_text(json.dumps(final))
   run = reading.read(folder)
-  assert statistics.last([run]).mean == 0.75 and tables.solved(run) == "150 of 200"
+  assert statistics.last([run]).mean == 0.75 and tables.solved([run]) == "150 of 200"
+
+
+def test_an_evaluation_counts_if_all_runs_have_one_that_is_not_older(tmp_path, capfd):
+  one, other = (make_run(tmp_path / x, [0.5, 0.6], seed=i) for i, x in enumerate("ab"))
+  final = {"success_rate": 0.75, "episodes": 200, "checkpoint_step": 2000}
+  (one / "evaluation.json").write_text(json.dumps(final))
+  assert tables.solved(reading.find([tmp_path])) == "30 of 50, 30 of 50"
+  (other / "evaluation.json").write_text(json.dumps(final))
+  assert tables.solved(reading.find([tmp_path])) == "150 of 200, 150 of 200"
+  (other / "evaluation.json").write_text(json.dumps(final | {"checkpoint_step": 1000}))
+  assert tables.solved(reading.find([tmp_path])) == "30 of 50, 30 of 50"
+  assert "from step 1,000, before the last evaluation" in capfd.readouterr().err
+  (other / "evaluation.json").write_text(json.dumps({"acting": {}}))
+  with pytest.raises(FileError, match="not what `apnpql evaluate --json` prints"):
+    reading.read(other)
 
 
 def test_tables_have_the_figures_of_the_runs(sweep):

@@ -136,13 +136,18 @@ def test_large_files_are_renamed_and_taken_back(tmp_path: Path):
   assert [row["step"] for row in rows] == [resume, 99]
 
 
-def test_a_damaged_record_is_refused(tmp_path: Path):
+@pytest.mark.parametrize("line", ["oops", '{"a": 1}', "[1]", '{"step": "x"}'])
+def test_a_damaged_line_is_left_out_and_kept(line: str, tmp_path: Path, capfd):
   path = tmp_path / "metrics.jsonl"
-  for text in ("oops\n", '{"a": 1}\n', "[1]\n", '{"step": "x"}\n'):
-    path.write_text('{"step": 1}\n' + text)
-    with pytest.raises(UserError, match=r"metrics.jsonl, line 2: not a row"):
-      metrics.MetricWriter(tmp_path)
-    assert path.read_text().endswith(text)
+  text = f'{{"step": 1}}\n{line}\n{{"step": 2}}\n{{"step": 3}}\n'
+  path.write_text(text)
+  with pytest.raises(UserError, match=r"metrics.jsonl, line 2: not a row"):
+    metrics.read_rows(path)
+  metrics.MetricWriter(tmp_path, resume_step=2).close()
+  assert [row["step"] for row in metrics.read_rows(path)] == [1, 2]
+  assert (tmp_path / "metrics.damaged.jsonl").read_text() == text
+  assert "line 2: not a row of metrics; left out" in capfd.readouterr().err
+  assert metrics.metric_files(tmp_path) == [path]
 
 
 def test_more_sinks_get_the_same_numbers(tmp_path: Path):

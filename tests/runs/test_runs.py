@@ -155,6 +155,21 @@ def test_settings_that_change_at_a_resume_are_recorded(tmp_path):
   assert provenance.changed_versions(run) == []
 
 
+def test_only_the_file_of_a_task_can_have_changed(tmp_path):
+  file = tmp_path / "mine.py"
+  file.write_text("task = 1")
+  config = TrainConfig()
+  preset_only = run_folder.create(tmp_path / "preset", config).path
+  with_task = dataclasses.replace(config.env, task_file=str(file))
+  run = run_folder.create(
+    tmp_path / "task", dataclasses.replace(config, env=with_task)
+  ).path
+  assert not provenance.changed_task(run, file)
+  file.write_text("task = 2")
+  assert provenance.changed_task(run, file)
+  assert not provenance.changed_task(preset_only, file)
+
+
 def test_a_run_in_training_is_not_replaced(tmp_path):
   run, other = write_run(tmp_path / "run"), write_run(tmp_path / "other")
   with run_folder.lock(run), run_folder.lock(other):

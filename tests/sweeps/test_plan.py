@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from run_files import make_run
 
-from apnpql_jax.cli.sweep import config_of, parse_sweep
+from apnpql_jax.cli.sweep import check_begun, config_of, parse_sweep
 from apnpql_jax.errors import ConfigError, FileError
+from apnpql_jax.runs import run_folder
 from apnpql_jax.sweeps import manifest as states
 from apnpql_jax.sweeps.manifest import Manifest, find_equal, load, open_folder
 from apnpql_jax.sweeps.plan import make_plan
@@ -120,6 +121,26 @@ def test_a_run_with_other_options_is_not_taken_for_the_same(tmp_path):
   other = make_plan(["push_plate"], ["agent.epsilon=0.5,1"], options=["--obs", "state"])
   with pytest.raises(ConfigError, match="with other options: apnpql train push_plate"):
     open_folder(tmp_path / "sweep", other)
+
+
+def test_a_preset_that_has_changed_is_noticed(tmp_path):
+  def planned(name: str, change: str) -> Manifest:
+    preset = tmp_path / name
+    preset.write_text(
+      "import dataclasses\n"
+      "from apnpql_jax import load_preset\n"
+      f"CONFIG = dataclasses.replace(load_preset('push_plate'), {change})\n"
+    )
+    (run,) = make_plan([str(preset)], [])
+    return Manifest(tmp_path, [states.Entry("run", run.argv)])
+
+  begun = planned("a.py", "total_steps=1000")
+  check_begun(begun)  # Nothing has begun.
+  run_folder.create(tmp_path / "run", config_of(begun.runs[0].argv))
+  check_begun(begun)
+  check_begun(planned("b.py", "total_steps=1000, checkpoint_every=7"))
+  with pytest.raises(ConfigError, match=r"total_steps.*remove it to train it again"):
+    check_begun(planned("c.py", "total_steps=2000"))
 
 
 def test_a_folder_with_other_files_is_refused(tmp_path):

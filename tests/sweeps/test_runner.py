@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 from pathlib import Path
@@ -269,11 +270,29 @@ def test_on_a_terminal_there_is_a_table(columns, tmp_path, monkeypatch):
   assert "50 %" in row and "100 %" in row
 
 
-def test_a_run_that_has_begun_is_resumed_with_the_file_of_its_task(tmp_path: Path):
-  work = Work("a", ["./mine.py", "--seed", "1"], tmp_path, tmp_path / "log")
+def test_a_full_disk_costs_only_the_manifest(tmp_path, monkeypatch, capfd):
+  sweep = sweep_of(tmp_path, "", "")
+  saved = []
+
+  def save() -> None:
+    saved.append(1)
+    if len(saved) > 1:
+      raise OSError(errno.ENOSPC, "No space left on device")
+
+  monkeypatch.setattr(sweep, "save", save)
+  assert run(sweep) == ["a", "b"]
+  assert [entry.state for entry in sweep.runs] == ["done", "done"]
+  assert "cannot save the manifest: [Errno 28] No space left" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("devices", [["--devices", "4"], ["--devices=4"]])
+def test_a_run_that_has_begun_is_resumed_with_what_it_does_not_store(
+  devices, tmp_path: Path
+):
+  work = Work("a", ["./mine.py", *devices, "--seed", "1"], tmp_path, tmp_path / "log")
   assert work.command()[3:] == ["train", *work.argv, "--run", str(tmp_path)]
   (tmp_path / run_folder.CONFIG_FILE).touch()
   resumed = ["train", "--resume", str(tmp_path), "--task-file", "./mine.py"]
-  assert work.command()[3:] == resumed
+  assert work.command()[3:] == [*resumed, "--devices", "4"]
   named = work._replace(argv=["push_plate"])
   assert named.command()[3:] == resumed[:3]
