@@ -144,7 +144,8 @@ class Env:
     """
     count = action.shape[0]
     rows = jax.random.randint(key, (count,), 0, self.bank_split)
-    keys = jax.random.split(jax.random.fold_in(key, 1), count)
+    # Drawing the rows splits the key in two; ``fold_in`` with 0 or 1 would repeat it.
+    keys = jax.random.split(jax.random.fold_in(key, 2), count)
     return self.advance_or_begin(state, action, rows, keys)
 
   def advance_or_begin(
