@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -9,6 +12,9 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
+from apnpql_jax.config.files import mjcf_path
+from apnpql_jax.config.ranges import RandomizationConfig
+from apnpql_jax.randomization.randomize import make_randomize
 from apnpql_jax.render import CameraSpec, Geoms, render
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.kinematics import Kinematics
@@ -32,10 +38,49 @@ MOTIONS = [
 """Degree of freedom of a free body, speed in m/s or rad/s, whether that is rest."""
 
 
+def painted(folder: Path) -> Path:
+  """Writes push_plate's scene with a material, a texture and a checker to a file."""
+  plate = 'size="0.083 0.003" rgba="0.12 0.30 0.80 1"'
+  added = """
+    <asset>
+      <texture name="shade" type="cube" builtin="gradient" rgb1="1 0.4 0.2"
+               rgb2="0.6 0.2 0.4" width="64" height="64"/>
+      <texture name="squares" type="2d" builtin="checker" rgb1="0.8 0.8 0.2"
+               rgb2="0.5 0.2 0.8" width="64" height="64"/>
+      <material name="plain" rgba="0.9 0.1 0.1 1"/>
+      <material name="shade" texture="shade" rgba="0.8 0.8 0.8 1"/>
+      <material name="squares" texture="squares" texuniform="true" texrepeat="20 20"/>
+    </asset>
+    <worldbody>
+      <geom name="crate" type="box" size="0.1 0.1 0.1" pos="0.7 0 0.1"
+            material="shade"/>
+      <geom name="mat" type="plane" size="0.1 0.1 1" pos="0.5 0.25 0.002"
+            material="squares"/>
+    </worldbody>"""
+  text = mjcf_path("push_plate").read_text()
+  assert plate in text
+  text = text.replace(plate, 'size="0.083 0.003" material="plain"')
+  path = folder / "painted.xml"
+  path.write_text(text.replace("</mujoco>", f"{added}</mujoco>"))
+  return path
+
+
 def drawn(task: Task, worlds: int, *, seed: int = 3) -> PhysicsState:
   """Draws initial states of a task."""
   draw = task.sample_resets(np.random.default_rng(seed), worlds)
   return physics.initial_state(task.scene, *map(jnp.asarray, draw))
+
+
+def randomized(
+  scene: Scene, config: RandomizationConfig, qpos: np.ndarray | None = None
+) -> PhysicsState:
+  """Returns eight randomized worlds of a scene, from qpos[8, nq] or the keyframe."""
+  qpos = np.tile(scene.keyframe("neutral"), (8, 1)) if qpos is None else qpos
+  mocap = np.zeros((8, scene.model.nmocap, 7))
+  draw = qpos, mocap[..., :3], mocap[..., 3:], np.zeros(8, int)
+  state = physics.initial_state(scene, *map(jnp.asarray, draw))
+  keys = jax.random.split(jax.random.key(0), 8)
+  return jax.jit(make_randomize(config, scene))(state, keys)
 
 
 def each_cup(task: Task, worlds: int) -> tuple[PhysicsState, np.ndarray]:

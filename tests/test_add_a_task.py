@@ -87,6 +87,21 @@ def test_the_task_of_the_guide_runs(tmp_path: Path):
   assert "no file 'touch_ball.py'" in refusal(tmp_path, *evaluate, *given)
 
 
+def test_a_name_whose_files_could_not_be_loaded_is_refused(tmp_path: Path):
+  for name in ("My Task", "2boxes", "_box", "none"):
+    assert f"{name!r} cannot name a task" in refusal(tmp_path, "new-task", name)
+  assert "'push_plate' exists" in refusal(tmp_path, "new-task", "push_plate")
+  # Each scene includes these; a file of the same name next to it would replace them.
+  for name in ("arena", "robot"):
+    assert f"{name}.xml; choose another name" in refusal(tmp_path, "new-task", name)
+  assert not any(tmp_path.iterdir())
+
+
+def test_a_missing_folder_is_made(tmp_path: Path):
+  made = result(tmp_path, "new-task", "mine", "--folder", "my/tasks")
+  assert made["task"] == "my/tasks/mine.py" and (tmp_path / made["task"]).is_file()
+
+
 def test_errors_name_the_file_and_the_line(tmp_path: Path):
   run(tmp_path, "new-task", "mine")
   task, scene = tmp_path / "mine.py", tmp_path / "mine.xml"
@@ -110,8 +125,6 @@ def test_errors_name_the_file_and_the_line(tmp_path: Path):
   assert f"{scene} does not compile" in line and "geon" in line and "line 5" in line
   scene.unlink()
   assert "mine" in refusal(tmp_path, *collect)
-  assert "'My Task' cannot name a task" in refusal(tmp_path, "new-task", "My Task")
-  assert "'push_plate' exists" in refusal(tmp_path, "new-task", "push_plate")
 
 
 def test_installed_packages_bring_tasks_and_presets(tmp_path: Path):
@@ -133,3 +146,11 @@ def test_installed_packages_bring_tasks_and_presets(tmp_path: Path):
   assert "theirs.missing is left out" in listed.stderr
   collect = ("collect", "touch_ball", "--episodes", "8")
   assert json.loads(run(tmp_path, *collect, site=site).stdout)["successes"] == 8
+  # Gymnasium has a task whose preset has the same name, and imports nothing for it.
+  code = (
+    "import sys, apnpql_jax.gym, gymnasium; gymnasium.spec('apnpql/TouchBall-v0'); "
+    "assert not {'theirs', 'jax'} & set(sys.modules)"
+  )
+  path = os.pathsep.join((str(site), str(ROOT)))
+  env = dict(os.environ, PYTHONPATH=path)
+  subprocess.run([sys.executable, "-c", code], env=env, check=True)

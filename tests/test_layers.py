@@ -11,9 +11,9 @@ PACKAGE = Path(__file__).resolve().parents[1] / "apnpql_jax"
 NAME = PACKAGE.name
 
 STAIR = (
-  "errors types atomic console runtime dists config devices sim render tasks templates "
-  "randomization primitives envs gym agents data runs reports sweeps training viewing "
-  "deploy robot transfer testing doctor cli __main__"
+  "errors types atomic colors console runtime dists config devices sim render tasks "
+  "templates randomization primitives envs gym agents data runs reports sweeps "
+  "training viewing deploy robot transfer testing doctor cli __main__"
 ).split()
 """Rooms from the bottom up: each imports only from itself and from earlier ones."""
 

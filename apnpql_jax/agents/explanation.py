@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 from flax import struct
@@ -44,7 +43,8 @@ class Explanation(struct.PyTreeNode):
   """Its Q."""
 
   primitives: Float[Array, "*b 3 7"]
-  """Predicted action primitives: joint velocities in rad/s, logit of closing."""
+  """Predicted action primitives: joint velocities in rad/s, logit of closing. With
+  ``env.true_primitives`` the prior has the true ones instead."""
 
   candidates: Float[Array, " s *b 7"]
   """Candidates, clipped to the action box. For ap_npql and rows that project by the
@@ -74,9 +74,9 @@ class Explanation(struct.PyTreeNode):
 
     def picked(node: Any) -> dict[str, Any]:
       return {
-        field.name: x[:, state] if field.name in sampled else x[state]
-        for field in dataclasses.fields(node)
-        if isinstance(x := getattr(node, field.name), jax.Array)
+        name: x[:, state] if name in sampled else x[state]
+        for name, x in vars(node).items()
+        if name != "prior"
       }
 
     prior = self.prior and self.prior.replace(**picked(self.prior))

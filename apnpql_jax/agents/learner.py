@@ -125,10 +125,10 @@ def make_agent(config: AgentConfig) -> Agent:
   def update(
     state: LearnerState, batch: Transition, key: PRNGKeyArray
   ) -> tuple[LearnerState, Metrics]:
-    key_t, key_tm1 = jax.random.split(key)
+    key_t, key_tm1, key_image = jax.random.split(key, 3)
     if config.image_shift or config.color_jitter:
       batch = augment(
-        jax.random.fold_in(key, 1),
+        key_image,
         batch,
         shift=config.image_shift,
         jitter=config.color_jitter,

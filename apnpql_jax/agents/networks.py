@@ -99,7 +99,7 @@ class Heads:
   params: Params
   phi: Float[Array, "*b feature_dim"]
   given: Float[Array, "*b 3 7"] | None
-  """True primitives that replace the predicted ones."""
+  """True primitives, which replace the predicted ones in the prior."""
 
   @property
   def config(self) -> AgentConfig:
@@ -117,23 +117,21 @@ class Heads:
     They are unbounded: labels often lie at the bounds of [-1, 1], where a squashed
     output would lose its gradient.
     """
-    if self.given is None:
-      flat = self._apply("ap", self.phi)
-      found = flat.reshape(*self.phi.shape[:-1], NUM_PRIMITIVES, ACTION_DIM)
-    else:
-      found = self.given.at[..., -1].set(_SURE * (2.0 * self.given[..., -1] - 1.0))
+    flat = self._apply("ap", self.phi)
+    found = flat.reshape(*self.phi.shape[:-1], NUM_PRIMITIVES, ACTION_DIM)
     return found if self.config.primitive_gripper else found.at[..., -1].set(0.0)
 
   def prior(self) -> GripperGMM:
     """Returns the behavior prior b_theta; trains only the bp group.
 
-    Means are the predicted primitives, clipped to the action box (paper Sec. IV-A). The
-    M-step trains the rest of theta and must move neither the means nor phi.
+    Means are the predicted primitives, or the true ones if they are given, clipped to
+    the action box (paper Sec. IV-A). The M-step trains the rest of theta and must move
+    neither the means nor phi.
     """
     learned_mean = self.config.prior_mean == "learned"
     return mixture_from_outputs(
       self._apply("bp", jax.lax.stop_gradient(self.phi)),
-      None if learned_mean else self.frozen().primitives(),
+      None if learned_mean else self._means(),
       num=NUM_PRIMITIVES,
       min_std=self.config.min_std,
       initial_std=self.config.initial_std,
@@ -166,7 +164,8 @@ class Heads:
       log_alpha = raw + math.log(initial)
       alpha = jnp.exp(one_way_clip(log_alpha, math.log(lowest), math.inf))
     else:
-      offset = math.log(math.expm1(initial))  # Inverse of softplus.
+      # Inverse of softplus, which does not overflow.
+      offset = initial + math.log(-math.expm1(-initial))
       alpha = jax.nn.softplus(raw + offset) + lowest
     return jnp.broadcast_to(alpha, self.phi.shape[:-1])
 
@@ -180,6 +179,12 @@ class Heads:
   def q(self, actions: Float[Array, " s *b 7"]) -> Float[Array, " s *b"]:
     """Returns the expected return."""
     return self.networks.value(self.z(actions))
+
+  def _means(self) -> Float[Array, "*b 3 7"]:
+    if self.given is None:
+      return self.frozen().primitives()
+    sure = _SURE if self.config.primitive_gripper else 0.0
+    return self.given.at[..., -1].set(sure * (2.0 * self.given[..., -1] - 1.0))
 
   def _apply(self, group: str, *inputs: Array, **options: Any) -> Any:
     return self.networks.apply(group, self.params, *inputs, **options)

@@ -36,7 +36,7 @@ from apnpql_jax.agents.columns.regularizer import (
   uniform,
 )
 from apnpql_jax.agents.networks import GROUPS
-from apnpql_jax.config.schema import AgentConfig
+from apnpql_jax.config.schema import AgentConfig, TrainConfig
 from apnpql_jax.dists.action import ActionDistribution
 from apnpql_jax.errors import ConfigError, check_name
 
@@ -115,6 +115,28 @@ def algorithm_of(config: AgentConfig) -> Algorithm:
       "lacks; choose another policy evaluation"
     )
   return row
+
+
+def check_effects(config: TrainConfig) -> None:
+  """Checks that the row has the columns that these settings change.
+
+  This is for new runs. Older ones, in which such a setting has no effect, still load.
+
+  Raises:
+    ConfigError: A setting has no effect.
+  """
+  agent, row = config.agent, algorithm_of(config.agent)
+  prior, predicted = row.regularizer is behavior_prior, agent.prior_mean == "primitives"
+  mixture, true = agent.policy_components > 1, config.env.true_primitives
+  for name, idle, lacking in (
+    ("agent.policy_components", mixture and row.policy is not parametric, "policy pi"),
+    ("agent.prior_mean", not predicted and not prior, "prior b_theta"),
+    ("env.true_primitives", true and not (prior and predicted), "prior around them"),
+  ):
+    if idle:
+      raise ConfigError(
+        f"{name} has no effect: with these settings, {agent.algorithm} has no {lacking}"
+      )
 
 
 def imitates(config: AgentConfig) -> bool:

@@ -341,11 +341,10 @@ def check_free(path: Path | None, *, overwrite: bool) -> None:
 
 def task_env(task: str) -> EnvConfig:
   """Returns the environment of a task that exists, or of the preset in its file."""
-  if user_files.is_file(task):
-    return files.load_preset(task).env
-  from apnpql_jax import tasks
+  if not user_files.is_file(task):
+    from apnpql_jax import tasks
 
-  check_name("task", task, tasks.task_names())
+    check_name("task", task, tasks.task_names())
   return files.task_env(task)
 
 

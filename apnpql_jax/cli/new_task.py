@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import keyword
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -31,7 +32,7 @@ class NewTask(Command):
   uses_jax: ClassVar[bool] = False
 
   name: tyro.conf.Positional[str] = ""
-  """Name of the task: lower-case letters, digits and underscores."""
+  """Name of the task: a lower-case letter, then letters, digits and underscores."""
 
   folder: Path = Path(".")
   """Folder to write to."""
@@ -44,18 +45,21 @@ def new_task(args: NewTask) -> dict[str, Any]:
     ConfigError: The name cannot be used, a file exists, or the folder cannot be
       written.
   """
-  if not files.is_name(args.name):
+  if not files.is_name(args.name) or keyword.iskeyword(_camel(args.name)):
     raise ConfigError(
-      f"{args.name!r} cannot name a task; use lower-case letters, digits and "
-      "underscores: apnpql new-task my_task"
+      f"{args.name!r} cannot name a task; use a lower-case letter, then lower-case "
+      "letters, digits and underscores: apnpql new-task my_task"
     )
   if args.name in files.preset_names():
     raise ConfigError(f"task {args.name!r} exists; choose another name")
+  if f"{args.name}.xml" in files.mjcf_files():
+    raise ConfigError(f"scenes include {args.name}.xml; choose another name")
   check_writable(args.folder)
   wanted = {suffix: args.folder / f"{args.name}{suffix}" for suffix in (".py", ".xml")}
   for path in wanted.values():
     if path.exists():
       raise ConfigError(f"{path} exists; choose another name or --folder")
+  args.folder.mkdir(parents=True, exist_ok=True)
   for suffix, path in wanted.items():
     text = (_TEMPLATES / f"{_EXAMPLE}{suffix}").read_text(encoding="utf-8")
     for old, new in ((_EXAMPLE, args.name), (_camel(_EXAMPLE), _camel(args.name))):

@@ -16,6 +16,7 @@ from importlib import metadata
 import json
 from pathlib import Path
 import re
+from types import ModuleType
 from typing import Any
 
 from apnpql_jax.config import codec, user_files
@@ -24,7 +25,7 @@ from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.errors import ConfigError, check_name, one_line
 
 _PACKAGE = Path(__file__).resolve().parents[1]
-_NAME = re.compile(r"[a-z0-9][a-z0-9_]*")
+_NAME = re.compile(r"[a-z][a-z0-9_]*")
 
 
 def preset_names() -> list[str]:
@@ -48,7 +49,8 @@ def load_preset(name: str) -> TrainConfig:
     ConfigError: There is no such preset, or it defines no TrainConfig.
   """
   if user_files.is_file(name):
-    return _preset_of(Path(name))
+    module = user_files.load(name)
+    return _with_file(module, _checked(name, getattr(module, "CONFIG", None)))
   check_name("preset", name, preset_names())
   own = _names("experiments", ".py")
   if name in own:
@@ -61,14 +63,12 @@ def load_preset(name: str) -> TrainConfig:
     raise ConfigError(f"preset {name!r} fails with {reason}") from error
 
 
-def _preset_of(path: Path) -> TrainConfig:
+def _with_file(module: ModuleType, config: TrainConfig) -> TrainConfig:
   """Returns the preset of a file, which the settings name if it has the task, too."""
-  module = user_files.load(path)
-  config = _checked(str(path), getattr(module, "CONFIG", None))
   classes = (value for value in vars(module).values() if isinstance(value, type))
   if config.env.task not in (getattr(value, "name", None) for value in classes):
     return config
-  env = dataclasses.replace(config.env, task_file=str(path.resolve()))
+  env = dataclasses.replace(config.env, task_file=module.__file__)
   return dataclasses.replace(config, env=env)
 
 
@@ -85,14 +85,45 @@ def _installed() -> dict[str, metadata.EntryPoint]:
 
 
 def preset_tasks() -> list[str]:
-  """Returns the sorted names of the tasks that have a preset of their own."""
-  return [name for name in preset_names() if name in _names("mjcf", ".xml")]
+  """Returns the sorted names of the tasks that have a preset of their own.
+
+  An installed package has it if entry points of its task and preset have one name.
+  """
+  installed = metadata.entry_points(group="apnpql.tasks").names
+  tasks = {*_names("mjcf", ".xml"), *filter(is_name, installed)}
+  return [name for name in preset_names() if name in tasks]
 
 
 def task_env(task: str) -> EnvConfig:
-  """Returns the environment of a task's preset, or the default one for the task."""
-  env = load_preset(task).env if task in preset_names() else EnvConfig()
-  return dataclasses.replace(env, task=task)
+  """Returns ``task_preset(task).env``."""
+  return task_preset(task).env
+
+
+def task_preset(task: str) -> TrainConfig:
+  """Returns the preset of a task, or the default settings with the task.
+
+  Args:
+    task: The name of a task, or the path of its file. The preset of a name may come
+      from a file that this process has executed.
+
+  Raises:
+    ConfigError: See ``load_preset``.
+  """
+  if user_files.is_file(task):
+    return load_preset(task)
+  config = load_preset(task) if task in preset_names() else _executed(task)
+  return dataclasses.replace(config, env=dataclasses.replace(config.env, task=task))
+
+
+def _executed(task: str) -> TrainConfig:
+  """Returns the preset next to a task of the user's; the defaults if there is none."""
+  for module in user_files.loaded():
+    config = getattr(module, "CONFIG", None)
+    if isinstance(config, TrainConfig) and config.env.task == task:
+      config = _with_file(module, config)
+      if config.env.task_file:
+        return config
+  return TrainConfig()
 
 
 def is_name(text: str) -> bool:

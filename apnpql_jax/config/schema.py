@@ -57,8 +57,8 @@ class EnvConfig:
   moved."""
 
   true_primitives: bool = codec.added(False)
-  """Observations include the true primitives, and the agent takes them in place of its
-  predictions: an oracle, for ablations."""
+  """Observations include the true primitives, and the prior takes them in place of the
+  predicted ones: an oracle, for ablations."""
 
   randomize: bool = codec.added(False)
   """Randomize the world of every episode, within the ranges of `randomization`."""

@@ -29,6 +29,11 @@ def is_loaded(module: str) -> bool:
   return module.startswith(_PREFIX)
 
 
+def loaded() -> list[ModuleType]:
+  """Returns the modules of the files that this process has executed."""
+  return [module for name, module in sys.modules.items() if is_loaded(name)]
+
+
 def check_loaded(path: str, task: str) -> None:
   """Raises ``ConfigError`` unless this process has executed the file of a task."""
   if _module_name(Path(path)) not in sys.modules:

@@ -79,8 +79,8 @@ def exclude(replay: Replay, steps: Int[Array, " worlds"]) -> Replay:
 def exclude_lost(replay: Replay, start: int, stop: int) -> Replay:
   """Marks the slots at time indices from ``start`` to ``stop`` - 1 as truncated.
 
-  So is the slot before them, which was read but leads to none. No transition touches
-  the lost ones.
+  The slot before them is marked, too: it may end a transition but cannot start one. No
+  transition touches the lost ones.
   """
   length = replay.slots.action.shape[0]
   marked = (jnp.arange(length) - (start - 1)) % length <= stop - start
@@ -92,7 +92,11 @@ def exclude_lost(replay: Replay, start: int, stop: int) -> Replay:
 
 @jax.jit
 def episodes(replay: Replay) -> tuple[Int[Array, ""], Int[Array, ""]]:
-  """Counts successes and finished episodes; an excluded one counts once as finished."""
+  """Counts successes and finished episodes, at the first of adjacent last slots.
+
+  Excluded slots are last ones. They add one finished episode, or none if they follow an
+  end or fill the ring.
+  """
   timestep = replay.slots.timestep
   ends = timestep.last & ~jnp.roll(timestep.last, 1, axis=0)
   return jnp.sum(ends & timestep.terminated), jnp.sum(ends)
@@ -219,8 +223,8 @@ def _draw_starts(
 def _slots(replay: Replay, time: Array, world: Array, *, instants: int) -> Slot:
   """Gathers slots at (time, world) [*b], with observations [*b, L, ...] for L instants.
 
-  An episode begins after the newest end before its slot. If it is shorter than L, its
-  first observation is repeated.
+  The slot after the latest earlier end is the first of the episode. If the episode is
+  shorter than L, its first observation is repeated.
   """
   slots = _gather(replay.slots, time, world)
   if not instants:

@@ -20,7 +20,14 @@ from apnpql_jax.config import codec
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.runs import leaves
 from apnpql_jax.sim import motors
-from apnpql_jax.sim.scene import ARM_JOINTS, BASE_SITE, GRIPPER_JOINT, TOOL_SITE, Scene
+from apnpql_jax.sim.scene import (
+  ARM_JOINTS,
+  BASE_SITE,
+  GRIPPER_JOINT,
+  TOOL_SITE,
+  Scene,
+  fixed_bodies,
+)
 from apnpql_jax.types import ACTION_DIM, Array, Observation
 
 Json = dict[str, Any]
@@ -162,7 +169,7 @@ def _camera(
   optical = data.cam_xmat[index].reshape(3, 3) * np.array([1.0, -1.0, -1.0])
   camera = data.cam_xpos[index], optical
   site = data.site(FLANGE_SITE)
-  fixed = scene.model.cam_bodyid[index] == 0
+  fixed = fixed_bodies(scene.model)[scene.model.cam_bodyid[index]]
   where = camera if fixed else _relative(_pose(site.xpos, site.xmat), camera)
   return {
     "height": height,

@@ -12,7 +12,7 @@ from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.render import CameraSpec, Geoms, Lighting, render
 from apnpql_jax.render.shadow import SHADOWS
 from apnpql_jax.sim.kinematics import Kinematics
-from apnpql_jax.sim.scene import Scene
+from apnpql_jax.sim.scene import Scene, fixed_bodies
 from apnpql_jax.types import Array
 
 FLAT = 0.002  # m; thinner geoms are marks on the table and receive shadows as it does
@@ -58,7 +58,8 @@ def shadows_of_the_hand(scene: Scene, geoms: Geoms) -> dict[str, Any]:
   body, kind = model.geom_bodyid[geoms.ids], geoms.types
   casts = in_hand(scene)[geoms.ids] & np.isin(kind, list(SHADOWS))
   # What cannot move by itself, and is flat, receives the shadow.
-  still = (model.body_rootid[body] == 0) | (model.body_mocapid[body] >= 0)
+  root = model.body_weldid[body]
+  still = fixed_bodies(model)[root] | (model.body_mocapid[root] >= 0)
   shapes = mujoco.mjtGeom
   half_height = np.select(
     [kind == shapes.mjGEOM_BOX, kind == shapes.mjGEOM_CYLINDER],

@@ -99,9 +99,11 @@ class Env:
     """Number of held-out rows."""
     return self._bank.rows - self.bank_split
 
-  def reset(self, rows: Int[Array, " worlds"]) -> EnvState:
-    """Starts one world per bank row; a row always has the same randomization."""
-    return self.observe(self.begin(rows))
+  def reset(
+    self, rows: Int[Array, " worlds"], keys: PRNGKeyArray | None = None
+  ) -> EnvState:
+    """Starts one world per bank row; see ``begin``."""
+    return self.observe(self.begin(rows, keys))
 
   def step(
     self, state: EnvState, action: Float[Array, "worlds 7"], key: PRNGKeyArray
@@ -109,10 +111,14 @@ class Env:
     """Runs one control period in every world; see ``advance``."""
     return self.observe(self.advance(state, action, key))
 
-  def begin(self, rows: Int[Array, " worlds"]) -> Arrival:
-    """Starts one world per bank row: first half of ``reset``."""
+  def begin(
+    self, rows: Int[Array, " worlds"], keys: PRNGKeyArray | None = None
+  ) -> Arrival:
+    """Starts one world per bank row: first half of ``reset``.
+
+    A key per world draws its randomization. Without keys, a row always has the same.
+    """
     count = rows.shape[0]
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), rows)
     first = Arrival(
       physics=self._initial(rows, keys),
       targets=self._bank.targets[rows],
@@ -138,7 +144,8 @@ class Env:
     """
     count = action.shape[0]
     rows = jax.random.randint(key, (count,), 0, self.bank_split)
-    keys = jax.random.split(jax.random.fold_in(key, 1), count)
+    # Drawing the rows splits the key in two; ``fold_in`` with 0 or 1 would repeat it.
+    keys = jax.random.split(jax.random.fold_in(key, 2), count)
     return self.advance_or_begin(state, action, rows, keys)
 
   def advance_or_begin(
@@ -146,9 +153,9 @@ class Env:
     state: EnvState,
     action: Float[Array, "worlds 7"],
     rows: Int[Array, " worlds"],
-    keys: PRNGKeyArray,
+    keys: PRNGKeyArray | None,
   ) -> Arrival:
-    """Runs ``advance`` with given resets: a bank row and a key for each world."""
+    """Runs ``advance`` with given resets: ``rows`` and ``keys`` as in ``begin``."""
     physics_step = devices.per_device(self.physics.step, self.mesh)
     moved = physics_step(state.physics, action[:, :6], action[:, 6])
     # Reset worlds whose episode is over or whose state is broken.
@@ -197,9 +204,11 @@ class Env:
     """Repeats L times, [worlds, ...] -> [worlds, L, ...]."""
     return jnp.repeat(x[:, None], self._instants, axis=1)
 
-  def _initial(self, rows: Array, keys: PRNGKeyArray) -> PhysicsState:
+  def _initial(self, rows: Array, keys: PRNGKeyArray | None) -> PhysicsState:
     """Returns worlds at rest at rows of the bank, randomized if configured."""
     bank = self._bank
+    if keys is None:
+      keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), rows)
     drawn = bank.qpos, bank.mocap_pos, bank.mocap_quat, bank.variant
     state = physics.initial_state(self.task.scene, *(x[rows] for x in drawn))
     return state if self._randomize is None else self._randomize(state, keys)
@@ -298,6 +307,8 @@ def make_env(
   _substeps(config, task.scene)
   if config.obs == "pixels":
     make_cameras(config, task.scene)
+  if config.randomize:
+    make_randomize(config.randomization, task.scene)
   bank, _ = reset_bank.load_bank(task, config.bank_rows, seed=bank_seed)
   return Env(config, task, bank, mesh, instants=instants, imitated=imitated)
 

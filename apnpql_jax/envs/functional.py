@@ -22,7 +22,7 @@ from jaxtyping import Float, PRNGKeyArray
 
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.envs.env import Env, make_env
-from apnpql_jax.envs.state import EnvState
+from apnpql_jax.envs.state import EnvState, truncate_faults
 from apnpql_jax.types import ACTION_DIM, Array
 
 
@@ -30,7 +30,7 @@ class State(struct.PyTreeNode):
   """The state of a world, with the fields of ``brax.envs.State``."""
 
   pipeline_state: EnvState
-  """State of the simulation, with a first axis of one world."""
+  """State of the simulation, ``Env``'s without the axis of worlds."""
 
   obs: dict[str, Array]
   """Fields of ``types.Observation``."""
@@ -45,14 +45,17 @@ class State(struct.PyTreeNode):
   """``success``: whether the task is solved."""
 
   info: dict[str, Any]
-  """``truncation``: whether the time ran out; ``rng``: key of the world."""
+  """``truncation``: whether the time ran out or the world broke; ``fault``: whether it
+  broke; ``rng``: key of the world."""
 
 
 class FunctionalEnv:
   """A task as pure functions ``reset(rng)`` and ``step(state, action)``.
 
   A step from a state that is done ignores the action and returns the first state of a
-  random episode, so no wrapper for resets is needed.
+  random episode, so no wrapper for resets is needed. What wrappers add to ``metrics``
+  and ``info`` is kept. A world that becomes non-finite is done, with the observation
+  before it broke.
   """
 
   action_size = ACTION_DIM
@@ -76,13 +79,16 @@ class FunctionalEnv:
 
   def _reset(self, rng: PRNGKeyArray) -> State:
     rows, keys, rng = self._draw(rng)
-    del keys
-    return _state(self.env.reset(rows), rng)
+    return _state(self.env.reset(rows, keys), rng)
 
   def _step(self, state: State, action: Float[Array, "worlds 7"]) -> State:
     rows, keys, rng = self._draw(state.info["rng"])
-    arrival = self.env.advance_or_begin(state.pipeline_state, action, rows, keys)
-    return _state(self.env.observe(arrival), rng)
+    before = state.pipeline_state
+    arrival = self.env.advance_or_begin(before, action, rows, keys)
+    worlds = truncate_faults(before, self.env.observe(arrival))
+    after = _state(worlds, rng, before.faults)
+    metrics, info = state.metrics | after.metrics, state.info | after.info
+    return after.replace(metrics=metrics, info=info)
 
   def _draw(self, rng: PRNGKeyArray) -> tuple[Array, PRNGKeyArray, PRNGKeyArray]:
     """Draws a row of the bank and a key for each world; returns the next keys, too."""
@@ -92,7 +98,8 @@ class FunctionalEnv:
     return rows, split[:, 1], split[:, 2]
 
 
-def _state(worlds: EnvState, rng: PRNGKeyArray) -> State:
+def _state(worlds: EnvState, rng: PRNGKeyArray, faults: Array | int = 0) -> State:
+  """Returns the state after a step; ``faults`` are those before it, i32[worlds]."""
   timestep = worlds.timestep
   fields = vars(worlds.observation).items()
   return State(
@@ -101,7 +108,11 @@ def _state(worlds: EnvState, rng: PRNGKeyArray) -> State:
     reward=timestep.reward,
     done=timestep.last.astype(jnp.float32),
     metrics={"success": timestep.terminated.astype(jnp.float32)},
-    info={"truncation": timestep.truncated.astype(jnp.float32), "rng": rng},
+    info={
+      "truncation": timestep.truncated.astype(jnp.float32),
+      "fault": (worlds.faults > faults).astype(jnp.float32),
+      "rng": rng,
+    },
   )
 
 

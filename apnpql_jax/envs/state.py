@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+
 from flax import struct
+import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
@@ -80,6 +83,23 @@ class Arrival(struct.PyTreeNode):
       faults=before.faults,
       recent=before.recent,
     )
+
+
+def truncate_faults(before: EnvState, after: EnvState) -> EnvState:
+  """Truncates the episodes of worlds that a step from ``before`` has found broken.
+
+  Such a world is already in another episode. Its observation becomes the last one of
+  the episode that broke, so that no transition leads from one episode to another.
+  """
+  broken = after.faults > before.faults
+  observation = jax.tree.map(
+    functools.partial(where_world, broken),
+    before.timestep.observation,
+    after.timestep.observation,
+  )
+  truncated = after.timestep.truncated | broken
+  timestep = after.timestep.replace(observation=observation, truncated=truncated)
+  return after.replace(timestep=timestep)
 
 
 def where_world(condition: Bool[Array, " worlds"], yes: Array, no: Array) -> Array:

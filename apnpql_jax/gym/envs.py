@@ -14,6 +14,11 @@ preset. Episodes start from the bank's training rows, or from its held-out rows 
 - Reward: 1 at the instant of success, which terminates the episode, otherwise 0. The
   time limit truncates it; Gymnasium's ``TimeLimit`` is not needed.
 - ``info["success"]``: whether the task is solved.
+- ``info["fault"]``: whether the world has become non-finite. This truncates the
+  episode, with the observation before it.
+
+With ``randomize=True``, every reset draws a new world. Only held-out rows always have
+the same one, as in evaluations.
 """
 
 from __future__ import annotations
@@ -28,6 +33,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 import jax
 import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
 import numpy as np
 
 from apnpql_jax import runtime
@@ -35,7 +41,7 @@ from apnpql_jax.config import files
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.envs.cameras import VIEW_SIZE, camera_renderer
 from apnpql_jax.envs.env import Env, make_env
-from apnpql_jax.envs.state import EnvState, where_world
+from apnpql_jax.envs.state import EnvState, truncate_faults, where_world
 from apnpql_jax.types import ACTION_DIM, Array
 
 Json = dict[str, Any]
@@ -54,11 +60,9 @@ class Worlds:
     runtime.configure()
     config = dataclasses.replace(files.task_env(task), **settings, worlds=count)
     self.env: Env = make_env(config)
-    self.count, self._split = count, self.env.bank_split
-    self._rows = (self._split, self._split + self.env.held_out)
-    if not held_out:
-      self._rows = (0, self._split)
+    self.count, self._held_out = count, held_out
     self.state: EnvState | None = None
+    self.faults = np.zeros(count, bool)
     self._reset, self._step = jax.jit(self.env.reset), jax.jit(self._advance)
     self._merge, self._expert = jax.jit(_merged), jax.jit(self.env.expert_action)
     example = jax.eval_shape(self.env.reset, jnp.zeros(count, jnp.int32)).observation
@@ -75,16 +79,19 @@ class Worlds:
 
   def reset(self, rng: np.random.Generator, mask: np.ndarray | None = None) -> None:
     """Starts an episode in every world, or where ``mask`` bool[worlds] is true."""
-    state = self._reset(jnp.asarray(rng.integers(*self._rows, self.count)))
+    rows = self._rows(rng)
+    # Plain worlds need no keys, and drawing them would change the rows that follow.
+    keys = self._keys(rng) if self.env.config.randomize else None
+    state = self._reset(rows, keys)
     if mask is not None and self.state is not None:
       state = self._merge(jnp.asarray(mask), state, self.state)
     self.state = state
 
   def step(self, actions: np.ndarray, rng: np.random.Generator) -> None:
     """Runs one control period; a world whose episode is over starts another one."""
-    rows = jnp.asarray(rng.integers(*self._rows, self.count))
-    keys = jax.random.split(jax.random.key(rng.integers(2**31)), self.count)
-    self.state = self._step(self._started(), jnp.asarray(actions), rows, keys)
+    before, rows = self._started(), self._rows(rng)
+    self.state = self._step(before, jnp.asarray(actions), rows, self._keys(rng))
+    self.faults = np.asarray(self.state.faults > before.faults)
 
   def observation(self) -> dict[str, np.ndarray]:
     """Returns the observations, each with a first axis of worlds."""
@@ -107,12 +114,26 @@ class Worlds:
     action[:, -1] = np.where(action[:, -1] > 0.5, 1.0, -1.0)
     return action
 
+  def _rows(self, rng: np.random.Generator) -> Array:
+    """Draws a row of the bank for each world, i32[worlds]."""
+    split = self.env.bank_split
+    ends = (split, split + self.env.held_out) if self._held_out else (0, split)
+    return jnp.asarray(rng.integers(*ends, self.count))
+
+  def _keys(self, rng: np.random.Generator) -> PRNGKeyArray | None:
+    """Draws a key for each world; None if their rows determine the randomization."""
+    seed = rng.integers(2**31)
+    if self._held_out:
+      return None
+    return jax.random.split(jax.random.key(seed), self.count)
+
   def _advance(
-    self, state: EnvState, action: Array, rows: Array, keys: Any
+    self, state: EnvState, action: Array, rows: Array, keys: PRNGKeyArray | None
   ) -> EnvState:
     velocity, close = action[:, :-1], action[:, -1:] > 0.0
     action = jnp.concatenate([velocity.clip(-1.0, 1.0), close], axis=-1)
-    return self.env.observe(self.env.advance_or_begin(state, action, rows, keys))
+    arrival = self.env.advance_or_begin(state, action, rows, keys)
+    return truncate_faults(state, self.env.observe(arrival))
 
   def _started(self) -> EnvState:
     if self.state is None:
@@ -146,7 +167,7 @@ class ManipulationEnv(gymnasium.Env):
     """Starts an episode; ``seed`` determines it and those that follow."""
     super().reset(seed=seed)
     self._worlds.reset(self.np_random)
-    return self._observation(), {"success": False}
+    return self._observation(), {"success": False, "fault": False}
 
   def step(
     self, action: np.ndarray
@@ -154,7 +175,7 @@ class ManipulationEnv(gymnasium.Env):
     """Runs one control period."""
     self._worlds.step(np.asarray(action, np.float32)[None], self.np_random)
     reward, terminated, truncated = (x[0].item() for x in self._worlds.flags())
-    info = {"success": terminated}
+    info = {"success": terminated, "fault": self._worlds.faults[0].item()}
     return self._observation(), reward, terminated, truncated, info
 
   def render(self) -> np.ndarray | None:
@@ -210,8 +231,7 @@ class ManipulationVectorEnv(gymnasium.vector.VectorEnv):
     super().reset(seed=seed)
     mask = (options or {}).get("reset_mask")
     self._worlds.reset(self.np_random, mask)
-    nowhere = np.zeros(self.num_envs, bool)
-    return self._worlds.observation(), _info(nowhere)
+    return self._worlds.observation(), self._info()
 
   def step(
     self, actions: np.ndarray
@@ -228,9 +248,9 @@ class ManipulationVectorEnv(gymnasium.vector.VectorEnv):
       )
     worlds.step(np.asarray(actions, np.float32), self.np_random)
     reward, terminated, truncated = worlds.flags()
-    info, done = _info(terminated), terminated | truncated
+    info, done = self._info(terminated, worlds.faults), terminated | truncated
     if self._mode is AutoresetMode.SAME_STEP and done.any():
-      info |= self._final(done, info)
+      info = self._info() | self._final(done, info)
       worlds.reset(self.np_random, done)
     return worlds.observation(), reward, terminated, truncated, info
 
@@ -246,6 +266,12 @@ class ManipulationVectorEnv(gymnasium.vector.VectorEnv):
     _, terminated, truncated = self._worlds.flags()
     return terminated | truncated
 
+  def _info(self, success: Any = False, fault: Any = False) -> Json:
+    """Returns the infos of all worlds; each argument is bool[worlds], or for all."""
+    everywhere = np.ones(self.num_envs, bool)
+    infos = {"success": success & everywhere, "fault": fault & everywhere}
+    return infos | {f"_{name}": everywhere for name in infos}
+
   def _final(self, done: np.ndarray, info: Json) -> Json:
     """Returns the last observations and infos of the episodes that are over."""
     observation = self._worlds.observation()
@@ -255,7 +281,7 @@ class ManipulationVectorEnv(gymnasium.vector.VectorEnv):
     return {
       "final_obs": final,
       "_final_obs": done,
-      "final_info": info | {"_success": done},
+      "final_info": info | {"_success": done, "_fault": done},
       "_final_info": done,
     }
 
@@ -266,10 +292,6 @@ def _box(example: jax.ShapeDtypeStruct) -> spaces.Box:
   if example.dtype == np.uint8:
     return spaces.Box(0, 255, shape, np.uint8)
   return spaces.Box(-np.inf, np.inf, shape, np.float32)
-
-
-def _info(success: np.ndarray) -> Json:
-  return {"success": success, "_success": np.ones_like(success)}
 
 
 def _rate(config: EnvConfig) -> Json:

@@ -22,7 +22,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 import torch
 
-from apnpql_jax.config.files import load_preset
+from apnpql_jax.config.files import task_preset
 from apnpql_jax.gym.stable_baselines import Observations, StableBaselinesVecEnv
 
 N_STEP, GAMMA = 5, 0.99
@@ -37,14 +37,14 @@ def make_sac(
   """Builds SAC with a replay that has demonstrations of a task.
 
   Args:
-    task: Name of the task.
+    task: Name of the task, or the path of its file.
     worlds: Worlds that one program steps.
     updates: Gradient steps after each step of the worlds.
     seed: Of networks, actions and episodes.
     options: Arguments of ``stable_baselines3.SAC`` that replace these, other than
       those of the replay.
   """
-  replay = load_preset(task).replay
+  replay = task_preset(task).replay
   env = StateVector(StableBaselinesVecEnv(task, worlds, **_shared(task)))
   returns = {"n_steps": N_STEP, "gamma": options.get("gamma", GAMMA)}
   learner = SAC(
@@ -175,4 +175,4 @@ def fill(
 
 def _shared(task: str) -> dict[str, Any]:
   """Returns the settings that training and evaluation have in common."""
-  return {"obs": "state", "bank_rows": load_preset(task).env.bank_rows}
+  return {"obs": "state", "bank_rows": task_preset(task).env.bank_rows}

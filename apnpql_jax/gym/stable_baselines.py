@@ -26,9 +26,9 @@ class StableBaselinesVecEnv(VecEnv):
       task, num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings
     )
     self._actions = np.zeros(self.worlds.action_space.shape or ())
-    self.render_mode = self.worlds.render_mode
     spaces = self.worlds.single_observation_space, self.worlds.single_action_space
     super().__init__(num_envs, *spaces)
+    self.metadata["render_fps"] = self.worlds.metadata["render_fps"]
 
   def reset(self) -> Observations:
     """Starts an episode in every world; ``seed`` before it determines which."""
@@ -44,14 +44,20 @@ class StableBaselinesVecEnv(VecEnv):
   def step_wait(self) -> tuple[Observations, np.ndarray, np.ndarray, list[dict]]:
     """Runs one control period in every world; ended episodes start again at once."""
     observation, reward, terminated, truncated, info = self.worlds.step(self._actions)
+    faults = info.get("final_info", info)["fault"]
+    flags = (x.tolist() for x in (terminated, truncated, faults))
     infos: list[dict[str, Any]] = [
-      {"success": success, "is_success": success, "TimeLimit.truncated": late}
-      for success, late in zip(terminated.tolist(), truncated.tolist(), strict=True)
+      {"success": x, "is_success": x, "TimeLimit.truncated": late, "fault": fault}
+      for x, late, fault in zip(*flags, strict=True)
     ]
     done = terminated | truncated
     for world in np.flatnonzero(done):
       infos[world]["terminal_observation"] = info["final_obs"][world]
     return observation, reward.astype(np.float32), done, infos
+
+  def get_images(self) -> Sequence[np.ndarray | None]:
+    """Returns a view of the robot in each world, u8[H, W, 3], as ``render`` needs."""
+    return self.worlds.render() or [None] * self.num_envs
 
   def close(self) -> None:
     """Does nothing: the worlds are arrays."""

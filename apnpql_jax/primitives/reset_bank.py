@@ -29,6 +29,7 @@ from rich.progress import Progress
 
 from apnpql_jax import tasks
 from apnpql_jax.atomic import replacing
+from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.console import Unfailing, print_line, reporting
 from apnpql_jax.errors import ConfigError, UserError, one_line
 from apnpql_jax.primitives import ik
@@ -44,7 +45,7 @@ VERSION = 3  # part of the cache key; increased when the meaning of a bank chang
 SEED = 0  # of the banks that training and its evaluations use
 CHUNK = 32
 MAX_DRAWS = 20  # per row before the task is rejected for lack of usable resets
-SETTLE_PERIODS = 4  # control periods of 0.15 s at rest before a draw is accepted
+SETTLE_PERIODS = 4  # default control periods at rest before a draw is accepted
 SETTLE_SPEED = 0.05  # m/s and rad/s; above float32 contact noise (0.04)
 SETTLE_SHIFT = 0.005  # m; an object that settles further away overlapped with another
 MAX_TRAVEL = 2.5  # rad; turning further, a joint would pass through another branch
@@ -195,7 +196,8 @@ def _settled(
   """Returns drawn states that stay at rest while the arm holds still, and variants."""
   draw = jax.tree.map(jnp.asarray, task.sample_resets(rng, count))
   state = physics.initial_state(task.scene, *draw)
-  engine = NativePhysics(task.scene, substeps=30)
+  substeps = round(EnvConfig.control_period_s / task.scene.model.opt.timestep)
+  engine = NativePhysics(task.scene, substeps=substeps)
   closed = state.qpos[:, task.scene.gripper_qpos] > 0.5
   for _ in range(SETTLE_PERIODS):
     state = engine.step(state, jnp.zeros((count, 6)), closed.astype(jnp.float32))
@@ -251,10 +253,17 @@ def _file_name(task: Task, rows: int, seed: int) -> str:
 
 
 def _source(task: Task) -> str:
-  """Returns a hash of the task's file and of the files shared by tasks."""
-  own = pathlib.Path(inspect.getfile(type(task)))
-  digest = hashlib.sha256(own.read_bytes())
-  for path in sorted(pathlib.Path(tasks.__file__).parent.glob("*.py")):
-    if "\n@register_task\n" not in (text := path.read_text(encoding="utf-8")):
-      digest.update(text.encode())
-  return digest.hexdigest()
+  """Returns a hash of the files of the task's classes and of those shared by tasks."""
+  shared = [
+    path
+    for path in sorted(pathlib.Path(tasks.__file__).parent.glob("*.py"))
+    if "\n@register_task\n" not in path.read_text(encoding="utf-8")
+  ]
+  own = [
+    pathlib.Path(inspect.getfile(one))
+    for one in type(task).__mro__
+    if one.__module__ not in sys.stdlib_module_names
+  ]
+  files = dict.fromkeys([path for path in own if path not in shared] + shared)
+  contents = (path.read_bytes() for path in files)
+  return hashlib.sha256(b"".join(contents)).hexdigest()

@@ -10,6 +10,7 @@ from jaxtyping import PRNGKeyArray
 import mujoco
 import numpy as np
 
+from apnpql_jax.colors import geom_rgba
 from apnpql_jax.config.ranges import RandomizationConfig
 from apnpql_jax.render import Lighting
 from apnpql_jax.sim.scene import free_joints
@@ -46,6 +47,8 @@ class World(dict[str, Array]):
     self.model = model
 
   def __missing__(self, name: str) -> Array:
+    if name == "geom_rgba":
+      return jnp.asarray(geom_rgba(self.model))
     source = Lighting() if name == "background" else self.model
     return jnp.asarray(getattr(source, name), jnp.float32)
 

@@ -21,7 +21,7 @@ from apnpql_jax.randomization import objects, visuals
 from apnpql_jax.randomization.draw import Draw, World
 from apnpql_jax.sim.motors import GRIPPER_SPEED
 from apnpql_jax.sim.physics import PhysicsState
-from apnpql_jax.sim.scene import Scene
+from apnpql_jax.sim.scene import Scene, fixed_bodies
 from apnpql_jax.types import Array
 
 SEEN = (
@@ -34,7 +34,12 @@ Randomize = Callable[[PhysicsState, Array], PhysicsState]  # of states at rest a
 
 
 def make_randomize(config: RandomizationConfig, scene: Scene) -> Randomize:
-  """Returns the function that draws a world for each episode."""
+  """Returns the function that draws a world for each episode.
+
+  Raises:
+    ConfigError: The objects of the scene cannot change as ``config`` says.
+  """
+  objects.check(config, scene)
 
   def one(state: PhysicsState, key: PRNGKeyArray) -> PhysicsState:
     draw, world = Draw(key, config), World(scene.model, state.fields)
@@ -68,7 +73,8 @@ def seen_only(config: RandomizationConfig) -> RandomizationConfig:
 def _cameras(draw: Draw, world: World) -> None:
   config, count = draw.config, world.model.ncam
   if config.camera_shift:
-    share = np.where(world.model.cam_bodyid == 0, 1.0, WRIST_SHARE).astype(np.float32)
+    fixed = fixed_bodies(world.model)[world.model.cam_bodyid]
+    share = np.where(fixed, 1.0, WRIST_SHARE).astype(np.float32)
     world["cam_pos"] += share[:, None] * draw.uniform("camera_shift", (count, 3))
   if config.camera_turn:
     turn = draw.uniform("camera_turn", (count, 3))

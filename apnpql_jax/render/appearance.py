@@ -21,7 +21,7 @@ from apnpql_jax.types import Array
 # is the background.
 FIELDS = (
   "geom_size",  # f32[*b, ngeom, 3]: MuJoCo half sizes, m
-  "geom_rgba",  # f32[*b, ngeom, 4]: alpha is ignored
+  "geom_rgba",  # f32[*b, ngeom, 4]: as of ``colors.geom_rgba``; alpha is ignored
   "waves",  # f32[*b, ngeom + 1, 3, 4]: see ``texture``; requires the next two
   "odd_rgb",  # f32[*b, ngeom + 1, 3]: color of odd squares
   "grain",  # f32[*b, ngeom + 1]: largest share of the brightness that noise removes

@@ -14,6 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from apnpql_jax import colors
 from apnpql_jax.console import print_line
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.render.hull import LEAST_FILL, THIN, hull_of
@@ -45,23 +46,24 @@ class Geoms:
       ConfigError: A visible geom is of another type, or a mesh that fills too little of
         its hull.
     """
-    rgba = _effective_rgba(model)
+    rgba, untextured = colors.geom_rgba(model), colors.material_rgba(model)
     ids = np.flatnonzero((rgba[:, 3] > 0) & np.isin(model.geom_group, groups))
     ids = ids[np.argsort(model.geom_type[ids], kind="stable")]
-    colors, odd_colors = rgba[ids, :3].copy(), np.zeros((len(ids), 3))
-    checker, hulls = np.zeros(len(ids)), {}
+    checker, odd_colors, hulls = np.zeros(len(ids)), np.zeros((len(ids), 3)), {}
     sizes = model.geom_size[ids].copy()
     for k, i in enumerate(ids):
+      _check_type(model, i)
       if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_MESH:
         hulls[k], sizes[k] = _read_hull(model, i), np.maximum(sizes[k], THIN)
-      if (texture := _read_texture(model, i)) is not None:
-        checker[k], even, odd = texture
-        colors[k], odd_colors[k] = colors[k] * even, colors[k] * odd
+      if (texture := colors.read_texture(model, i)) is not None:
+        checker[k], odd_colors[k] = texture.edge, untextured[i, :3] * texture.odd
+        if not texture.edge:
+          _print_once(f"the texture of {_title(model, i)} is drawn as its mean color")
     return cls(
       ids=ids.astype(np.int32),
       types=model.geom_type[ids].astype(np.int32),
       sizes=sizes.astype(np.float32),
-      colors=colors.astype(np.float32),
+      colors=rgba[ids, :3],
       checker=checker.astype(np.float32),
       checker_colors=odd_colors.astype(np.float32),
       hulls=hulls,
@@ -159,15 +161,6 @@ class Lighting:
     return cls(direction=(x, y, z), id=int(lights[0]), **settings)
 
 
-def _effective_rgba(model: mujoco.MjModel) -> np.ndarray:
-  """Returns f32[ngeom, 4]: as in MuJoCo, a material replaces only the default rgba."""
-  rgba = model.geom_rgba.copy()
-  default = np.all(rgba == np.array([0.5, 0.5, 0.5, 1.0], rgba.dtype), axis=1)
-  use_material = (model.geom_matid >= 0) & default
-  rgba[use_material] = model.mat_rgba[model.geom_matid[use_material]]
-  return rgba
-
-
 def _read_hull(model: mujoco.MjModel, geom_id: int) -> np.ndarray:
   """Returns the planes of a mesh that looks like its convex hull."""
   planes, fill = hull_of(model, geom_id)
@@ -184,43 +177,16 @@ def _title(model: mujoco.MjModel, geom_id: int) -> str:
   return repr(model.geom(geom_id).name or f"geom {geom_id}")
 
 
-def _read_texture(
-  model: mujoco.MjModel, geom_id: int
-) -> tuple[float, np.ndarray, np.ndarray] | None:
-  """Reads a checker's edge (m), even and odd color; returns None without a texture.
-
-  The edge is 0 for another texture, and both colors are its mean.
-  """
-  kind, material = int(model.geom_type[geom_id]), model.geom_matid[geom_id]
-  name, valid = _title(model, geom_id), (*HITS, int(mujoco.mjtGeom.mjGEOM_MESH))
+def _check_type(model: mujoco.MjModel, geom_id: int) -> None:
+  kind, valid = int(model.geom_type[geom_id]), (*HITS, int(mujoco.mjtGeom.mjGEOM_MESH))
   if kind not in valid:
     found, *names = (
       mujoco.mjtGeom(x).name.removeprefix("mjGEOM_").lower() for x in (kind, *valid)
     )
     raise ConfigError(
-      f"cannot draw {name}: it is of type {found} (valid: {', '.join(names)}); replace "
-      'it, hide it with group="3", or use --obs state'
+      f"cannot draw {_title(model, geom_id)}: it is of type {found} (valid: "
+      f'{", ".join(names)}); replace it, hide it with group="3", or use --obs state'
     )
-  role = mujoco.mjtTextureRole.mjTEXROLE_RGB
-  texture = model.mat_texid[material, role] if material >= 0 else -1
-  if texture < 0:
-    return None
-  height, width = model.tex_height[texture], model.tex_width[texture]
-  channels, start = model.tex_nchannel[texture], model.tex_adr[texture]
-  data = model.tex_data[start : start + height * width * channels]
-  data = data.reshape(height, width, channels)[..., :3]
-  odd, even = data[height // 4, width // 4], data[height // 4, 3 * width // 4]
-  row, column = np.arange(height) * 2 // height, np.arange(width) * 2 // width
-  expected = np.where(((row[:, None] + column) % 2 == 0)[..., None], odd, even)
-  size = model.geom_size[geom_id, :2]
-  scale = np.where((size > 0) & ~model.mat_texuniform[material], size, 1.0)
-  scale = scale / model.mat_texrepeat[material]
-  plane = kind == mujoco.mjtGeom.mjGEOM_PLANE
-  if plane and np.array_equal(data, expected) and scale[0] == scale[1]:
-    return float(scale[0]), even / 255.0, odd / 255.0
-  _print_once(f"the texture of {name} is drawn as its mean color")
-  mean = data.mean((0, 1)) / 255.0
-  return 0.0, mean, mean
 
 
 @functools.cache

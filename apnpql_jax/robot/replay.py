@@ -47,7 +47,7 @@ def recorded_actions(folder: Path, contract: Json) -> list[np.ndarray]:
 def _difference(dataset: Any, contract: Json) -> str:
   """Returns the first difference between a log and a contract, or an empty string."""
   wanted, period = contract["action"], contract["control_period_s"]
-  if abs(1 / (dataset.fps * period) - 1) > _TOLERANCE:
+  if abs(1 / dataset.fps / period - 1) > _TOLERANCE:
     return f"its actions are {1 / dataset.fps:.4g} s apart, the policy's {period} s"
   for task in (episode.task for episode in dataset.episodes):
     if task != contract["task"]:

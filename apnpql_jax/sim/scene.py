@@ -9,12 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 import dataclasses
 import hashlib
+import operator
 import pathlib
 import warnings
 
 import mujoco
 import numpy as np
 
+from apnpql_jax.colors import geom_rgba
 from apnpql_jax.config import files
 from apnpql_jax.console import print_line
 from apnpql_jax.errors import ConfigError, one_line
@@ -74,11 +76,12 @@ def load_scene(
   """Compiles an MJCF file that includes the robot, and checks it.
 
   ``cameras`` must exist. Each world has one of the ``variants``: functions that edit
-  the parsed file, such as the shape of an object, but keep its structure.
+  the parsed file, such as the size of an object, but keep its structure.
 
   Raises:
     ConfigError: The file does not compile, lacks a joint, site or camera, uses a
-      feature that MJX would silently ignore, or changes the robot.
+      feature that MJX would silently ignore, or changes the robot; or its variants
+      differ in what all worlds share.
   """
   models = [compile_file(path, edit) for edit in variants or [lambda _: None]]
   model = models[0]
@@ -87,6 +90,7 @@ def load_scene(
   finger = _named_id(model, path.stem, "joint", GRIPPER_JOINT)
   for camera in cameras:
     _named_id(model, path.stem, "camera", camera)
+  scene_checks.check_variants(models, path.stem)
   for variant in models:
     scene_checks.check_robot(variant, path.stem)
     scene_checks.check_keyframes(variant, path.stem)
@@ -107,6 +111,11 @@ def load_scene(
 def free_joints(model: mujoco.MjModel) -> np.ndarray:
   """Returns the ids of the free joints, i64[n]."""
   return np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+
+
+def fixed_bodies(model: mujoco.MjModel) -> np.ndarray:
+  """Returns a mask bool[nbody] of the world and of the bodies without joints to it."""
+  return model.body_weldid == 0
 
 
 def _named_id(model: mujoco.MjModel, scene: str, kind: str, name: str) -> int:
@@ -164,7 +173,8 @@ def _differences(models: Sequence[mujoco.MjModel]) -> dict[str, np.ndarray]:
     value = getattr(models[0], field.name, None)
     if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
       continue
-    values = np.stack([getattr(model, field.name) for model in models])
+    shown = geom_rgba if field.name == "geom_rgba" else operator.attrgetter(field.name)
+    values = np.stack([shown(model) for model in models])
     if (values != values[0]).any():
       differences[field.name] = values.astype(np.float32)
   return differences

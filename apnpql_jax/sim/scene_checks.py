@@ -6,7 +6,10 @@ and the reset states rely on the robot of ``mjcf/robot.xml``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+import dataclasses
 import functools
+import operator
 from typing import Any
 
 import mujoco
@@ -38,26 +41,30 @@ _RANGE_CURE = (
 )
 _CURE = "remove the attribute, default or <compiler> setting that changes it"
 
+_UNUSED = ("name", "signature", "stat", "_", "opt._")
+"""Prefixes of fields that no world reads."""
+
+_SHARED = ("opt.", "mesh_", "hfield_")
+"""Prefixes of numbers that MJX makes constants of its program."""
+
 _FLAGS = "actuation clampctrl constraint contact equality gravity limit spring damper"
 
 
 def check_supported(model: mujoco.MjModel, name: str) -> None:
   """Checks for features that MJX rejects, or accepts without simulating them.
 
-  Source: the MJX-JAX engine of mujoco-mjx 3.17.0 has no code for these.
+  Source: the MJX-JAX engine of mujoco-mjx 3.17.0 has no code for these. The integrator
+  is the one that ``sim.mjx`` calls.
 
   Raises:
     ConfigError: The scene ``name`` uses such features; the message lists them.
   """
-  option, kinds = model.opt, mujoco.mjtIntegrator
-  integrators = kinds.mjINT_EULER, kinds.mjINT_RK4, kinds.mjINT_IMPLICITFAST
+  option, implicit = model.opt, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
   pgs = mujoco.mjtSolver.mjSOL_PGS
   sleep = getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0)
   found = {
     "option/noslip_iterations": option.noslip_iterations > 0,
-    "option/integrator (valid: Euler, RK4, implicitfast)": (
-      option.integrator not in map(int, integrators)
-    ),
+    "option/integrator (valid: implicitfast)": option.integrator != implicit,
     "option/solver PGS (valid: CG, Newton)": option.solver == pgs,
     "option/flag sleep": bool(option.enableflags & int(sleep)),
     "geom/surfacevel": bool(np.any(getattr(model, "geom_surfacevel", 0))),
@@ -105,19 +112,45 @@ def check_robot(model: mujoco.MjModel, name: str) -> None:
       raise ConfigError(f"{name}.xml: option flag {flag} is disabled; remove it")
 
 
+def check_variants(models: Sequence[mujoco.MjModel], name: str) -> None:
+  """Checks that the variants of a scene differ only in what each world has for itself.
+
+  Those are numbers, such as sizes, positions, masses and colors.
+
+  Raises:
+    ConfigError: Variants of the scene ``name`` differ in anything else that MJX reads.
+  """
+  fields = [f"opt.{field.name}" for field in dataclasses.fields(mjx.Option)]
+  fields += [field.name for field in dataclasses.fields(mjx.Model)]
+  for field in fields:
+    if field.startswith(_UNUSED):
+      continue
+    values = [operator.attrgetter(field)(model) for model in models]
+    own = isinstance(values[0], np.ndarray) and values[0].dtype.kind == "f"
+    if own and not field.startswith(_SHARED):
+      continue
+    if not all(np.array_equal(values[0], value) for value in values):
+      raise ConfigError(
+        f"{name}.xml: variants differ in {field}, which all worlds share; let them "
+        "differ in numbers only, such as sizes, positions, masses and colors"
+      )
+
+
 def check_keyframes(model: mujoco.MjModel, name: str) -> None:
-  """Checks that joints are within their limits in every keyframe.
+  """Checks that hinges and slides are within their limits in every keyframe.
 
   Raises:
     ConfigError: A joint of the scene ``name`` is not.
   """
+  kinds = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
+  limited = np.flatnonzero(model.jnt_limited & np.isin(model.jnt_type, kinds))
   for index in range(model.nkey):
     key, qpos = model.key(index).name, model.key_qpos[index]
-    for joint in range(model.njnt):
+    for joint in limited:
       address, where = model.jnt_qposadr[joint], f"joint '{model.joint(joint).name}'"
       low, high = model.jnt_range[joint]
       angle = qpos[address]
-      if model.jnt_limited[joint] and not low - 1e-6 <= angle <= high + 1e-6:
+      if not low - 1e-6 <= angle <= high + 1e-6:
         raise ConfigError(
           f"{name}.xml: keyframe '{key}' has {where} at {angle:g}, outside of its "
           f"range {_show(model.jnt_range[joint])}; correct its qpos"

@@ -157,6 +157,8 @@ def _check(
     memory_bytes=devices.available_memory(),
     devices=mesh.size if mesh else 1,
   )
+  if not resume:
+    table_one.check_effects(config)
   check_sinks(config.sinks)
   if handle_signals and threading.current_thread() is not threading.main_thread():
     raise ConfigError("handle_signals=True works in the main thread only")

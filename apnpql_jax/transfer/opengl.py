@@ -12,6 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from apnpql_jax.colors import geom_rgba, material_rgba
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.render import Lighting
 from apnpql_jax.sim.graphics import View
@@ -51,6 +52,8 @@ class OpenGL:
     self._sizes, self._unseen = rendered_sizes(config), frozenset(unseen)
     self.model = model = _with_textures(scene)
     self._plain = {name: getattr(model, name).copy() for name in _VARIED}
+    self._plain["geom_rgba"] = geom_rgba(model)
+    self._untextured = material_rgba(model) - geom_rgba(model)
     self._data = mujoco.MjData(model)
     mujoco.mj_forward(model, self._data)  # Places the lights.
     self._cameras = [scene.id("camera", name) for name in CAMERAS]
@@ -134,6 +137,8 @@ class OpenGL:
       model.geom_rgba[table, :3] = look.table_rgb
       surfaces = np.array(self._surfaces)[look.surfaces[model.geom_bodyid]]
       model.geom_matid[:] = np.where(table, self._tables[look.table], surfaces)
+    else:  # MuJoCo multiplies by the scene's textures itself.
+      model.geom_rgba += self._untextured
 
   def _add(self, scene: mujoco.MjvScene, look: looks.Look | None) -> None:
     """Adds what an unseen look has around the workspace."""

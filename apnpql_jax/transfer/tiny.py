@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from apnpql_jax.colors import geom_rgba
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.render import Geoms
@@ -54,6 +55,7 @@ class Tiny:
     """
     self._sizes = rendered_sizes(config)
     self._model, self._geoms = scene.model, Geoms.from_model(scene.model)
+    self._rgba = geom_rgba(scene.model)
     if (self._geoms.types == mujoco.mjtGeom.mjGEOM_MESH).any():
       raise ConfigError(f"{scene.name}.xml has meshes, which --renderer tiny lacks")
     self._cameras = [scene.id("camera", name) for name in CAMERAS]
@@ -86,7 +88,7 @@ class Tiny:
     world = self._world_of(field_of(self._model, fields, "geom_size"), row, look)
     world.place(poses["geom_xpos"], poses["geom_xmat"])
     if "surfaces" not in self._unseen:
-      world.color(field_of(self._model, fields, "geom_rgba"))
+      world.color(np.asarray(fields.get("geom_rgba", self._rgba)))
     background, lighting = self._lighting(fields, look)
     faults = look if "camera" in self._unseen else None
     angles, images = field_of(self._model, fields, "cam_fovy"), []

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from apnpql_jax.colors import geom_rgba
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.sim.scene import Scene
 
@@ -73,10 +74,10 @@ def _link(model: mujoco.MjModel, body: int) -> str:
 
 
 def _shapes(model: mujoco.MjModel, body: int) -> Iterator[str]:
-  first = model.body_geomadr[body]
+  first, colors = model.body_geomadr[body], geom_rgba(model)
   for geom in range(first, first + model.body_geomnum[body]):
     shape = _shape(model, geom)
-    rgba = model.geom_rgba[geom]
+    rgba = colors[geom]
     if rgba[3] > 0 and model.geom_group[geom] < 3:
       color = f'<color rgba="{_numbers(rgba)}"/>'
       material = f'<material name="geom_{geom}">{color}</material>'

@@ -154,7 +154,8 @@ class Networks(nn.Module):
   def temperature(self, phi: Tensor) -> Tensor:
     """Returns alpha, f32[B]."""
     raw = self.alpha(phi.detach())[..., 0]
-    offset = math.log(math.expm1(self.config.initial_alpha))
+    initial = self.config.initial_alpha
+    offset = initial + math.log(-math.expm1(-initial))
     return F.softplus(raw + offset) + self.config.min_alpha
 
   def primitives(self, phi: Tensor) -> Tensor:

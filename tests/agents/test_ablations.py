@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import re
 from typing import Any, NamedTuple
 
+import ablations
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,9 +14,7 @@ import pytest
 
 from apnpql_jax import testing
 from apnpql_jax.agents.learner import Agent, LearnerState, make_agent
-from apnpql_jax.cli.options import Train, parse
-from apnpql_jax.config import files
-from apnpql_jax.config.checks import validate
+from apnpql_jax.cli.sweep import config_of
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.data import replay
 from apnpql_jax.dists.gmm import GripperGMM
@@ -29,23 +29,30 @@ EVERYTHING = {
 }
 """Losses of AP-NPQL, and what an update moves."""
 
-GONE = {
+CHANGED = {
   "--agent.regularizer uniform": {"loss/m", "loss/nu", "bp", "nu"},
   "--agent.prior-mean learned": set(),
   "--agent.no-primitive-gripper": set(),
+  "--env.static-targets": set(),
+  "--env.true-primitives": set(),
   "--agent.learning-rate-m 0": {"bp"},
   "--agent.learning-rate-nu 0": {"nu"},
-  "--replay.expert-share 0 --replay.expert-steps 0": set(),
+  "--replay.expert-share 0": set(),
   "--agent.lambda-ap 0": {"ap"},
   "--agent.policy-evaluation td0": set(),
   "--agent.n-step 1": set(),
   "--agent.diagonal-covariance": set(),
-  "--agent.target-samples 10 --agent.policy-samples 500": set(),
-  "--agent.target-samples 500 --agent.policy-samples 10": set(),
-  "--agent.temperature shared": set(),
-  "--agent.temperature fixed": {"alpha"},
+  "--algorithm ap_mpo --agent.policy-components 3": {"loss/policy", "policy"},
+  "--agent.target-samples 10 --agent.policy-samples 10": set(),
+  "--agent.temperature shared --agent.learning-rate-alpha 3e-3": set(),
+  "--agent.temperature fixed --agent.initial-alpha 0.02": {"alpha"},
+  "--agent.alpha-floor clip": set(),
+  ablations.NO_Q: {"alpha"},
+  "--algorithm ap_dagger": set(),
+  "--agent.no-gripper-offset": set(),
 }
-"""Flags -> which of ``EVERYTHING`` they take away; the tests below have the rest."""
+"""Flags -> what they take from ``EVERYTHING`` or add to it; the tests below have the
+rest."""
 
 
 class Played(NamedTuple):
@@ -69,18 +76,22 @@ class Played(NamedTuple):
 
 
 def configured(flags: str) -> TrainConfig:
-  base = Train(config=files.load_preset("push_plate"))
-  # An entropy below its floor, so that nu has something to do from the first update.
-  args = [*testing.TINY_ARGS, "--agent.epsilon-nu", "5", *flags.split()]
-  config = parse(Train, "train", ["push_plate", *args], default=base).config
-  validate(config)
-  return config
+  # An entropy below its floor, so that nu has something to do from the first update,
+  # and draws for a mixture of three.
+  more = "--agent.epsilon-nu 5 --agent.target-samples 6 --agent.policy-samples 6"
+  return config_of(["push_plate", *testing.TINY_ARGS, *more.split(), *flags.split()])
 
 
 @functools.cache
 def play(flags: str) -> Played:
   config = configured(flags)
   agent, batch = make_agent(config.agent), random_batch(0, BATCH)
+  if config.env.true_primitives:
+    given = [
+      x.replace(primitives=batch.primitives_tm1)
+      for x in (batch.observation_tm1, batch.observation_t)
+    ]
+    batch = batch.replace(observation_tm1=given[0], observation_t=given[1])
   before = agent.init(jax.random.key(0), batch.observation_tm1)
   with jax.numpy_rank_promotion("raise"):
     update = jax.jit(agent.update)
@@ -96,14 +107,26 @@ def left(played: Played) -> set[str]:
   return groups | {name for name in played.metrics if name.startswith("loss/")}
 
 
-@pytest.mark.parametrize("flags", ["", *GONE])
-def test_an_ablation_removes_only_what_it_names(flags: str):
+def test_every_documented_ablation_is_played():
+  text = (testing.ROOT / "docs/algorithm.md").read_text("utf-8")
+  table = text.split("| ablation | flags | effect |")[1].split("\n\n")[0]
+  assert set(re.findall(r"\| `(--[^`]+)`", table)) == CHANGED.keys()
+
+
+@pytest.mark.parametrize("flags", ["", *CHANGED])
+def test_an_ablation_changes_only_what_it_names(flags: str):
   played = play(flags)
   for leaf in jax.tree.leaves((played.after, played.metrics)):
     assert np.all(np.isfinite(leaf))
-  assert left(played) == EVERYTHING - GONE.get(flags, set())
+  assert left(played) == EVERYTHING ^ CHANGED.get(flags, set())
   assert ("bp" in played.before.params) == ("uniform" not in flags)
   assert ("alpha" in played.before.params) == ("fixed" not in flags)
+
+
+def test_without_q_the_policy_is_the_prior():
+  played = play(ablations.NO_Q)
+  samples = played.config.agent.policy_samples
+  assert played.metrics["npql/ess"] == pytest.approx(samples, rel=1e-5)
 
 
 def test_learned_means_are_not_those_of_the_primitives():
@@ -125,7 +148,11 @@ def test_diagonal_covariance_moves_each_joint_by_itself():
   [
     ("", "z", {(51,)}),
     ("--agent.policy-evaluation td0", "z", {(1,)}),
-    ("--agent.temperature shared", "alpha", {(1,)}),
+    (
+      "--agent.temperature shared --agent.learning-rate-alpha 3e-3",
+      "alpha",
+      {(1,)},
+    ),
   ],
 )
 def test_heads_have_the_outputs_that_the_flag_names(flags, group, shapes):

@@ -10,12 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from apnpql_jax.agents.columns.regularizer import no_update
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.agents.table_one import ALGORITHMS
 from apnpql_jax.testing import SMALL, random_batch
 from apnpql_jax.types import Array, Transition
 
 BATCH, ROWS = 6, 32
+QUICK = ("ap_npql", "abm_mpo", "svg_prior", "ap_cem", "ap_dagger")
 KEPT = ("action", "discount", "weight", "terminated", "truncated")
 """Parts of a transition that keep their values."""
 
@@ -52,12 +54,21 @@ def absurd_batch(rows: Transition, key: Array) -> Transition:
 def _cases() -> list[Any]:
   """Returns rows, whether they see images, and numbers of updates.
 
-  All rows have the same encoder, so one of them sees images. The three together have
-  every kind of policy and evaluation.
+  All rows have the same encoder, so one of them sees images. The quick ones together
+  have every policy, update and evaluation.
   """
-  cases = [("ap_npql", True, 100), ("svg_prior", False, 100), ("ap_cem", False, 100)]
+  cases = [(name, name == "ap_npql", 100) for name in QUICK]
   slow = [(name, True, 1000) for name in ALGORITHMS]
   return cases + [pytest.param(*case, marks=pytest.mark.slow) for case in slow]
+
+
+def test_quick_rows_have_what_all_rows_have():
+  for column in ("policy", "regularizer_update", "policy_update", "policy_evaluation"):
+    of_quick, of_all = (
+      {getattr(ALGORITHMS[name], column) for name in names}
+      for names in (QUICK, ALGORITHMS)
+    )
+    assert of_quick == of_all - {no_update}
 
 
 @pytest.mark.parametrize(("name", "pixels", "updates"), _cases())

@@ -124,6 +124,21 @@ def test_images_of_one_window_change_identically():
       np.testing.assert_array_equal(new, new[..., :1, :, :, :].repeat(3, -4))
 
 
+def test_the_learner_augments_images_with_a_key_of_their_own():
+  """As if the images had been augmented before, by a key that draws nothing else."""
+  batch, key = random_batch(0, 4, pixels=True), jax.random.key(3)
+  plain = make_agent(CONFIG)
+  jittered = make_agent(dataclasses.replace(CONFIG, color_jitter=0.2))
+  state = plain.init(jax.random.key(0), batch.observation_tm1)
+  own = jax.random.split(key, 3)[2]
+  _, expected = jax.jit(plain.update)(
+    state, augment(own, batch, shift=0, jitter=0.2), key
+  )
+  _, found = jax.jit(jittered.update)(state, batch, key)
+  for name, value in expected.items():
+    np.testing.assert_allclose(found[name], value, rtol=1e-4, atol=1e-6, err_msg=name)
+
+
 @pytest.mark.parametrize("settings", [{"image_shift": 2}, {"color_jitter": 0.2}])
 def test_the_learner_augments_images_only_if_configured(settings):
   """Without augmentation its operations are absent from the compiled update."""

@@ -83,7 +83,7 @@ def test_means_are_the_predicted_primitives():
 
 def test_one_state_of_many():
   found, _ = explained("ap_npql")
-  one = jax.tree.map(jnp.asarray, found).at(3)
+  one = found.at(3)
   np.testing.assert_array_equal(one.q_values, found.q_values[:, 3])
   np.testing.assert_array_equal(one.candidates, found.candidates[:, 3])
   np.testing.assert_array_equal(one.prior.candidates, found.prior.candidates[:, 3])

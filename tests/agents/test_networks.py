@@ -530,7 +530,7 @@ def test_without_grippers_of_primitives_only_the_m_step_closes_the_hand():
 
 
 @pytest.mark.parametrize("instants", [0, 3])
-def test_true_primitives_replace_the_predicted_ones(instants: int):
+def test_true_primitives_replace_the_predicted_ones_in_the_prior(instants: int):
   networks = all_networks(dataclasses.replace(CONFIG, lstm_instants=instants))
   rng, batch = np.random.default_rng(5), (4, instants) if instants else (4,)
   true = jnp.asarray(rng.uniform(-1.0, 1.0, (*batch, 3, 7)), jnp.float32)
@@ -540,9 +540,13 @@ def test_true_primitives_replace_the_predicted_ones(instants: int):
   )
   heads = networks.at(jax.jit(networks.init)(jax.random.key(0), seen), seen)
   newest = true[:, -1] if instants else true
-  np.testing.assert_array_equal(heads.prior().loc, newest[..., :6])
-  closes = jax.nn.sigmoid(heads.primitives()[..., 6])
-  np.testing.assert_allclose(closes, newest[..., 6], atol=1e-3)
+  prior, least = heads.prior(), CONFIG.min_prob
+  np.testing.assert_array_equal(prior.loc, newest[..., :6])
+  closes = jax.nn.sigmoid(prior.gripper_logits)
+  np.testing.assert_allclose(
+    closes, np.clip(newest[..., 6], least, 1 - least), atol=1e-3
+  )
+  assert np.abs(heads.primitives()).max() < 0.1  # Those of a fresh head.
 
 
 def test_a_limit_lets_the_gradient_back_in():

@@ -14,16 +14,20 @@ import numpy as np
 import pytest
 from scipy import special
 
+from apnpql_jax import testing
 from apnpql_jax.agents import table_one
 from apnpql_jax.agents.columns import regularizer
 from apnpql_jax.agents.columns.candidates import clip_action
 from apnpql_jax.agents.columns.policy import parametric
 from apnpql_jax.agents.learner import Agent, bellman_target, make_agent, total_loss
 from apnpql_jax.agents.networks import Heads
-from apnpql_jax.agents.table_one import ALGORITHMS, algorithm_of
+from apnpql_jax.agents.table_one import ALGORITHMS, algorithm_of, check_effects
 from apnpql_jax.config import checks
+from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.dists.action import ActionDistribution, UniformBox
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.testing import SMALL, random_batch
+from apnpql_jax.training.train import train
 from apnpql_jax.types import Array, Metrics, Transition
 
 BATCH = 6
@@ -145,6 +149,42 @@ def test_settings_name_every_evaluation():
   assert {"row", *table_one.POLICY_EVALUATIONS} == set(checks.POLICY_EVALUATIONS)
 
 
+def changed(settings: dict[str, Any], *, true_primitives: bool = False) -> TrainConfig:
+  return dataclasses.replace(
+    testing.TINY,
+    env=dataclasses.replace(testing.TINY.env, true_primitives=true_primitives),
+    agent=dataclasses.replace(SMALL, **settings),
+  )
+
+
+@pytest.mark.parametrize(
+  ("settings", "idle"),
+  [
+    ({"policy_components": 3}, "agent.policy_components"),
+    ({"algorithm": "ap_cem", "policy_components": 3}, "agent.policy_components"),
+    ({"algorithm": "ap_dagger", "policy_components": 3}, "agent.policy_components"),
+    ({"algorithm": "mpo", "prior_mean": "learned"}, "agent.prior_mean"),
+    ({"algorithm": "sac", "prior_mean": "learned"}, "agent.prior_mean"),
+    ({"regularizer": "uniform", "prior_mean": "learned"}, "agent.prior_mean"),
+    ({"algorithm": "mpo"}, "env.true_primitives"),
+    ({"prior_mean": "learned"}, "env.true_primitives"),
+  ],
+)
+def test_a_new_run_refuses_a_setting_without_effect(settings, idle: str, tmp_path):
+  config = changed(settings, true_primitives=idle == "env.true_primitives")
+  with pytest.raises(ConfigError, match=f"{idle} has no effect: .* has no p"):
+    train(config, tmp_path / "run")
+  assert not (tmp_path / "run").exists()
+  make_agent(config.agent)  # Older runs with it can still be used.
+
+
+@pytest.mark.parametrize("name", ["ap_mpo", "svg_prior", "ap_dagger"])
+def test_a_new_run_may_change_what_its_row_has(name: str):
+  own = {"policy_components": 3} if COLUMNS[name].policy == "pi" else {}
+  check_effects(changed({"algorithm": name, "prior_mean": "learned", **own}))
+  check_effects(changed({"algorithm": name, **own}, true_primitives=True))
+
+
 def regularizer_of(name: str, heads: Heads, slow: Heads) -> ActionDistribution:
   kinds = {"b": heads.prior, "uniform": lambda: UniformBox((BATCH,), 6)}
   return {**kinds, "past": slow.policy}[COLUMNS[name].regularizer]()
@@ -209,7 +249,7 @@ def test_losses_are_those_of_the_candidates_that_the_row_names(name: str):
     expected["loss/policy"] = {"forward": forward, "reverse": reverse}[columns.kl]
   if columns.fitted_to == "good":
     # By draws of its own, not those of the policy update.
-    key = jax.random.fold_in(KEY, 1)
+    key = jax.random.fold_in(KEY, 2)
     candidates["good"] = of_good(heads, example.batch.action_tm1, key)
   if columns.fitted_to == "expert":
     assert example.batch.expert_tm1 is not None

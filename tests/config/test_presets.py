@@ -27,7 +27,7 @@ def write(folder: Path, name: str, text: str) -> None:
 
 def test_names_are_plain_words_and_sorted(package):
   folder = package.parent / "experiments"
-  for name in ("b.py", "a_2.py", "_private.py", "__init__.py", "Big.py", "c-d.py"):
+  for name in "b.py a_2.py _private.py __init__.py Big.py c-d.py 2b.py".split():
     write(folder, name, "raise RuntimeError('listing must not run this')")
   write(folder, "notes.txt", "")
   assert files.preset_names() == ["a_2", "b"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 import shutil
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from apnpql_jax.data import lerobot
+from apnpql_jax.data.lerobot.video import Video
 from apnpql_jax.errors import ConfigError, FileError, UserError
 
 pa = pytest.importorskip("pyarrow")
@@ -298,6 +300,54 @@ def test_damage_is_one_line(tmp_path, name, change):
     lerobot.read(folder)
   assert str(folder) in str(caught.value) and "\n" not in str(caught.value)
   assert "damaged" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+  ("key", "change", "words"),
+  [
+    ("fps", lambda _: 0, "its frames per second are 0.0"),
+    ("fps", lambda _: -5, "its frames per second are -5.0"),
+    ("names", lambda names: [*names, "w"], "observation.wrench in .* has 6 numbers"),
+    ("shape", lambda _: [5], "observation.wrench in .* has 6 numbers"),
+  ],
+)
+def test_numbers_that_do_not_fit_are_one_line(written, tmp_path, key, change, words):
+  folder = tmp_path / "dataset"
+  shutil.copytree(written[0], folder)
+  info = json.loads((folder / "meta/info.json").read_text())
+  place = info if key == "fps" else info["features"][WRENCH]
+  place[key] = change(place[key])
+  (folder / "meta/info.json").write_text(json.dumps(info))
+  with pytest.raises(FileError, match=words):
+    lerobot.read(folder)
+
+
+def test_videos_of_episodes_may_share_a_file(written, tmp_path):
+  """An episode, even of one frame, is found by its time and read to its end only."""
+  folder, episodes = tmp_path / "dataset", written[1]
+  shutil.copytree(written[0], folder)
+  path = folder / f"videos/{SMALL}/chunk-000/file-000.mp4"
+  video = Video(path.with_name("joined"), SIZES[SMALL], FPS)
+  for frame in itertools.chain(*episodes):
+    video.add(frame[SMALL])
+  video.finish(path)
+  starts = np.cumsum([0, *LENGTHS]) / FPS
+  for begin, row in zip(
+    starts, sorted((folder / "meta/episodes").rglob("*.parquet")), strict=False
+  ):
+    (about,) = pq.read_table(row).to_pylist()
+    about |= {f"videos/{SMALL}/file_index": 0, f"videos/{SMALL}/from_timestamp": begin}
+    pq.write_table(pa.Table.from_pylist([about]), row)
+  found = lerobot.read(folder).episodes
+  for episode, expected in zip(found, episodes, strict=True):
+    images = np.array([*episode.images(SMALL)], int)
+    assert abs(images - np.array([x[SMALL] for x in expected])).mean() < 2
+  with av.open(str(path)) as file:
+    *_, last = (x for x in file.demux(video=0) if x.size)
+  path.write_bytes(path.read_bytes().replace(bytes(last), b"\xff" * last.size))
+  assert len([*found[0].images(SMALL)]) == LENGTHS[0]
+  with pytest.raises(FileError, match="cannot read|lacks 1 of 1"):
+    [*found[2].images(SMALL)]
 
 
 def test_missing_parts_are_named(tmp_path):

@@ -138,6 +138,11 @@ def test_what_cannot_be_converted_is_named(tmp_path, env, folder):
   )
   names = [f"plate.{x}" for x in ("x", "y", "z", "qw", "qx", "qy", "qz")]
   refused(_rewrite(folder, tmp_path / "some", names), "lacks the poses of goal")
+  odd = _rewrite(folder, tmp_path / "odd", names)
+  info = json.loads((odd / "meta/info.json").read_text())
+  info["features"][lerobot.ENVIRONMENT]["names"] = [[name] for name in names]
+  (odd / "meta/info.json").write_text(json.dumps(info))
+  refused(odd, "lacks the poses of")
   whole = conversion.state_names(env.task.scene)
   fast = _rewrite(folder, tmp_path / "fast", whole, fps=30)
   refused(fast, "frames are 0.0333.* s apart, not 0.15 s")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import dataclasses
 import functools
 from typing import Any
@@ -248,11 +249,23 @@ def test_neither_transition_nor_window_reaches_an_excluded_episode():
 
 def test_episodes_are_counted_at_their_ends():
   """World 0 solves two episodes and times out in one; that of world 1 is excluded."""
+  assert _counted(excluded=5) == [2, 4]
+
+
+def test_an_excluded_episode_after_an_end_counts_with_it():
+  assert _counted(excluded=5, ends=[6]) == [2, 4]
+  assert _counted(excluded=5, ends=[2, 6]) == [2, 5]
+  assert _counted(excluded=12) == [2, 3]
+
+
+def _counted(excluded: int, ends: Sequence[int] = ()) -> list[int]:
+  """Successes and ends; world 1 times out at ``ends`` and then excludes slots."""
   stream = _stream(12, WORLDS, end_rate=0.0, seed=0)
   stream.timestep.terminated[[2, 9], 0] = True
   stream.timestep.truncated[6, 0] = True
-  replay = rb.exclude(_fill(stream, length=12, chunk=4), jnp.asarray([0, 5]))
-  assert [int(x) for x in rb.episodes(replay)] == [2, 4]
+  stream.timestep.truncated[list(ends), 1] = True
+  replay = rb.exclude(_fill(stream, length=12, chunk=4), jnp.asarray([0, excluded]))
+  return [int(x) for x in rb.episodes(replay)]
 
 
 def test_rewards_worked_by_hand():

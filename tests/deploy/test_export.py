@@ -21,11 +21,13 @@ from scipy.spatial.transform import Rotation
 from apnpql_jax import testing
 from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.cli.main import main
+from apnpql_jax.config.files import mjcf_path
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.deploy import contract, program
 from apnpql_jax.deploy.export import export
 from apnpql_jax.envs.env import observation_shapes
 from apnpql_jax.errors import FileError, UserError
+from apnpql_jax.sim.scene import load_scene
 from apnpql_jax.tasks import make_task
 from apnpql_jax.training.train import train
 from apnpql_jax.types import Observation
@@ -206,6 +208,21 @@ def test_contract_projects_points_to_the_pixels_where_they_are_seen(camera):
   column, row = lens["fx"] * x / z + lens["cx"], lens["fy"] * y / z + lens["cy"]
   # The center of what is seen of a box lies near the projection of its center.
   assert abs(column - columns.mean()) < 2.5 and abs(row - rows.mean()) < 2.5
+
+
+def test_contract_gives_a_camera_on_a_stand_in_the_world():
+  def add(spec: mujoco.MjSpec) -> None:
+    tripod = spec.worldbody.add_body(pos=[0.0, 1.0, 0.5]).add_body(quat=[1, 1, 0, 0])
+    tripod.add_camera(name="side", pos=[0.1, 0.2, 0.3])
+
+  scene = load_scene(mjcf_path("stack_box"), variants=[add])
+  data = mujoco.MjData(scene.model)
+  mujoco.mj_forward(scene.model, data)
+  shown = contract._camera(data, scene, "side", (72, 96))
+  position, turn = pose(shown["pose_in_world"])
+  np.testing.assert_allclose(position, data.camera("side").xpos, atol=1e-8)
+  expected = data.camera("side").xmat.reshape(3, 3) * [1, -1, -1]
+  np.testing.assert_allclose(turn, expected, atol=1e-8)
 
 
 def pose(shown: dict) -> tuple[np.ndarray, np.ndarray]:

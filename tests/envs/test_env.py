@@ -198,6 +198,15 @@ def play(env):
   return make_player(env, lambda noise: expert_policy(env, noise=noise))
 
 
+def test_worlds_are_drawn_by_other_keys_than_rows(env, monkeypatch):
+  """``randint`` splits its key in two and draws the rows by both."""
+  monkeypatch.setattr(Env, "advance_or_begin", lambda *args: args[-1])
+  key = jax.random.key(0)
+  found = env.advance(env.reset(jnp.arange(4)), jnp.zeros((4, 7)), key)
+  for used in jax.random.split(key):
+    assert np.all(found != jax.random.split(used, 4))
+
+
 def test_evaluation_is_repeatable(env, play):
   first, again, other = (
     play_held_out(env, play, 0.3, episodes=16, seed=seed) for seed in (5, 5, 6)

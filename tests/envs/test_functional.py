@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,18 +16,20 @@ from apnpql_jax.envs.functional import FunctionalEnv, State
 WORLDS, PERIODS = 3, 5
 
 
+def make(**settings: Any) -> FunctionalEnv:
+  small: dict[str, Any] = {"obs": "state", "bank_rows": 16, "backend": "native"}
+  return FunctionalEnv(dataclasses.replace(task_env("push_plate"), **small | settings))
+
+
 @pytest.fixture(
   scope="module", params=["native", pytest.param("mjx", marks=pytest.mark.slow)]
 )
 def env(request) -> FunctionalEnv:
-  config = dataclasses.replace(
-    task_env("push_plate"),
-    obs="state",
-    bank_rows=16,
-    backend=request.param,
-    time_limit_s=0.45,
-  )
-  return FunctionalEnv(config)
+  return make(backend=request.param, time_limit_s=0.45)
+
+
+def begun(env: FunctionalEnv, worlds: int = WORLDS) -> State:
+  return jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(2), worlds))
 
 
 def play(env: FunctionalEnv, key: jax.Array, actions: jax.Array) -> State:
@@ -61,6 +64,64 @@ def test_a_step_after_the_end_begins_a_random_episode(env):
   pose = states.obs["robot"][..., -7:]
   assert (abs(pose[:, 3] - pose[:, 2]).max(-1) > 1e-3).all()
   assert len({tuple(x) for x in np.asarray(pose[:, 3]).round(4).tolist()}) > 1
+
+
+def test_the_expert_ends_episodes_by_success():
+  env = make()
+
+  def period(state: State, _: None) -> tuple[State, State]:
+    action = env.env.expert_action(state.pipeline_state)
+    after = jax.vmap(env.step)(state, action)
+    return after, after
+
+  states = jax.jit(lambda state: jax.lax.scan(period, state, length=93)[1])(begun(env))
+  worlds, done = np.arange(WORLDS), np.asarray(states.done)
+  last = done.argmax(0)
+  for found in (done, states.reward, states.metrics["success"]):
+    np.testing.assert_array_equal(found[last, worlds], 1.0)
+    np.testing.assert_array_equal(found[last + 1, worlds], 0.0)
+  assert not states.info["truncation"][last, worlds].any()
+  np.testing.assert_array_equal(states.reward, states.metrics["success"])
+
+
+def test_every_reset_draws_a_new_world():
+  """Of 12 rows of the bank, which many of the worlds share."""
+  fields = begun(make(randomize=True), 32).pipeline_state.physics.fields
+  worlds = np.concatenate([x.reshape(32, -1) for x in fields.values()], axis=-1)
+  assert len(np.unique(worlds.round(5), axis=0)) == 32
+
+
+def test_a_world_that_breaks_ends_its_episode(env):
+  """Its observation stays that of the episode, as its next state is of another one."""
+  before, step = begun(env), jax.jit(jax.vmap(env.step))
+  actions = jnp.zeros((WORLDS, 7)).at[1, 0].set(jnp.nan)
+  after = step(before, actions)
+  for flag in (after.done, after.info["truncation"], after.info["fault"]):
+    np.testing.assert_array_equal(flag, [0, 1, 0])
+  assert not after.reward.any() and not after.metrics["success"].any()
+  robot = [np.asarray(x.obs["robot"]) for x in (before, after)]
+  np.testing.assert_array_equal((robot[0] == robot[1]).all(-1), [False, True, False])
+  begins = step(after, jnp.zeros((WORLDS, 7)))
+  assert not begins.done.any() and not begins.info["fault"].any()
+  assert (begins.obs["robot"][1] != after.obs["robot"][1]).any()
+
+
+def test_what_wrappers_add_to_a_state_is_kept(env):
+  """As Brax's ``EpisodeWrapper`` does; a scan needs the same keys in all states."""
+  state = begun(env)
+  steps, sums = jnp.arange(3.0), {"reward": jnp.ones(WORLDS)}
+  state = state.replace(
+    info=state.info | {"steps": steps, "episode_metrics": sums},
+    metrics=state.metrics | {"distance": steps},
+  )
+
+  def period(state: State, action: jax.Array) -> tuple[State, None]:
+    return jax.vmap(env.step)(state, action), None
+
+  after, _ = jax.lax.scan(period, state, jnp.zeros((PERIODS, WORLDS, 7)))
+  np.testing.assert_array_equal(after.info["steps"], steps)
+  np.testing.assert_array_equal(after.metrics["distance"], steps)
+  np.testing.assert_array_equal(after.info["episode_metrics"]["reward"], 1.0)
 
 
 def test_sizes(env):

@@ -14,9 +14,12 @@ import jax
 import numpy as np
 import pytest
 
+from apnpql_jax.cli.new_task import NewTask, new_task
 from apnpql_jax.config.files import preset_tasks
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.gym import env_id
+from apnpql_jax.gym.envs import ManipulationEnv
+from apnpql_jax.tasks import task
 
 SMALL: dict[str, Any] = {"obs": "state", "bank_rows": 16, "backend": "native"}
 NAMES = {name: env_id(name) for name in preset_tasks()}
@@ -39,11 +42,6 @@ def test_gymnasium_accepts_the_environment(name, obs):
     warnings.filterwarnings("ignore", ".*A Box observation space (min|max)imum value")
     warnings.filterwarnings("ignore", ".*render modes.*|.*render_modes.*")
     check_env(env.unwrapped)
-
-
-def test_stable_baselines_accepts_the_environment():
-  checker = pytest.importorskip("stable_baselines3.common.env_checker")
-  checker.check_env(make(obs="pixels", render_mode="rgb_array").unwrapped)
 
 
 def test_the_expert_solves_an_episode():
@@ -136,6 +134,111 @@ def test_episodes_end_as_in_the_vector_environment_of_gymnasium(mode):
         envs.reset(options={"reset_mask": done.copy()})
 
 
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
+def test_success_ends_episodes_as_in_the_vector_environment_of_gymnasium(mode):
+  """The expert plays the same worlds in both until an episode is over."""
+  ours = gymnasium.make_vec(
+    NAMES["push_plate"], num_envs=2, autoreset_mode=mode, **SMALL
+  )
+  theirs = gymnasium.vector.SyncVectorEnv([make] * 2, autoreset_mode=mode)
+  ours.reset(seed=3), theirs.reset(seed=3)
+  state = ours.unwrapped._worlds.state
+  for world, env in enumerate(theirs.envs):
+    one = jax.tree.map(lambda x: x[world : world + 1], state)  # noqa: B023
+    env.unwrapped._worlds.state = one
+  for _ in range(93):
+    action = ours.unwrapped.expert_action()
+    (_, *flags, info), (_, *expected, their_info) = (
+      e.step(action) for e in (ours, theirs)
+    )
+    for found, wanted in zip(flags, expected, strict=True):
+      np.testing.assert_array_equal(found, wanted)
+    if flags[1].any():
+      break
+  reward, solved, truncated = flags
+  assert solved.any() and not truncated.any()
+  np.testing.assert_array_equal(reward, solved)
+  observations = info.pop("final_obs", None), their_info.pop("final_obs", None)
+  assert data_equivalence(info, their_info)
+  if mode is AutoresetMode.SAME_STEP:
+    np.testing.assert_array_equal(info["final_info"]["success"], solved)
+    for world in np.flatnonzero(solved):
+      final, their_final = (x[world] for x in observations)
+      for name, value in final.items():
+        np.testing.assert_allclose(value, their_final[name], atol=1e-4)
+  else:
+    _, reward, terminated, _, info = ours.step(action)
+    assert not (reward[solved].any() or (terminated & solved).any())
+    assert not info["success"][solved].any()
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
+def test_a_world_that_breaks_ends_its_episode(mode):
+  """Its last observation is the one before, as its next one is of another episode."""
+  envs = gymnasium.make_vec(
+    NAMES["push_plate"], num_envs=3, autoreset_mode=mode, **SMALL
+  )
+  envs.reset(seed=0)
+  still = np.zeros((3, 7), np.float32)
+  before = envs.step(still)[0]["robot"]
+  actions, broken = still.copy(), np.array([False, True, False])
+  actions[1, 0] = np.nan
+  observation, reward, terminated, truncated, info = envs.step(actions)
+  np.testing.assert_array_equal(truncated, broken)
+  assert not terminated.any() and not reward.any()
+  last = observation["robot"]
+  if mode is AutoresetMode.SAME_STEP:
+    assert (last[1] != before[1]).any()
+    last, info = {1: info["final_obs"][1]["robot"]}, info["final_info"]
+  np.testing.assert_array_equal(info["fault"], broken)
+  np.testing.assert_array_equal(last[1], before[1])
+  after, _, _, truncated, info = envs.step(still)
+  assert (after["robot"][1] != before[1]).any()
+  assert not truncated.any() and not info["fault"].any()
+
+
+def test_every_reset_draws_a_new_world_but_held_out_rows():
+  """At ``reset`` and where an episode is over, of 12 training and 4 held-out rows."""
+
+  def drawn(**settings):
+    envs = gymnasium.make_vec(
+      NAMES["push_plate"], num_envs=16, randomize=True, **SHORT | settings
+    )
+    envs.reset(seed=0)
+    begun = [envs.unwrapped._worlds.state]
+    for _ in range(4):
+      envs.step(np.zeros((16, 7), np.float32))
+    begun.append(envs.unwrapped._worlds.state)
+    envs.reset(options={"reset_mask": np.ones(16, bool)})
+    begun.append(envs.unwrapped._worlds.state)
+    assert not any(state.elapsed.any() for state in begun)
+    fields = [x for state in begun for x in jax.tree.leaves(state.physics.fields)]
+    rows = [x.reshape(16, -1) for x in fields]
+    worlds = np.concatenate(rows, axis=-1).reshape(16, 3, -1).reshape(48, -1)
+    return np.unique(worlds.round(5), axis=0)
+
+  assert len(drawn()) == 48 and len(drawn(held_out=True)) == 4
+
+
+def test_the_file_of_a_task_has_its_preset(tmp_path, monkeypatch):
+  """By its path and, once it has been executed, by the name of the task."""
+  monkeypatch.setattr(task, "_REGISTRY", dict(task._REGISTRY))
+  new_task(NewTask(name="my_ball", folder=tmp_path))
+  file = tmp_path / "my_ball.py"
+  changed = 'task="my_ball", time_limit_s=6.0'
+  file.write_text(file.read_text().replace('task="my_ball"', changed))
+  env = ManipulationEnv(str(file), **SMALL)
+  env.reset(seed=0)
+  for _ in range(40):
+    _, reward, terminated, truncated, _ = env.step(env.expert_action())
+    if terminated or truncated:
+      break
+  assert terminated and reward == 1.0
+  config = env._worlds.env.config
+  assert config.time_limit_s == 6.0 and config.task_file == str(file)
+  assert ManipulationEnv("my_ball", **SMALL)._worlds.env.config == config
+
+
 def test_a_mask_resets_only_some_worlds():
   envs = gymnasium.make_vec(NAMES["push_plate"], num_envs=3, **SMALL)
   envs.reset(seed=0)
@@ -169,26 +272,3 @@ def test_registering_the_tasks_imports_neither_jax_nor_mujoco():
     "assert not {'jax', 'mujoco'} & set(sys.modules)"
   )
   subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_stable_baselines_sees_the_ends_of_episodes():
-  vec_env = pytest.importorskip("stable_baselines3.common.vec_env")
-  from apnpql_jax.gym.stable_baselines import StableBaselinesVecEnv
-
-  worlds = vec_env.VecMonitor(StableBaselinesVecEnv("push_plate", 2, **SHORT))
-  worlds.seed(0)
-  first = worlds.reset()
-  still = np.zeros((2, 7), np.float32)
-  steps = [worlds.step(still) for _ in range(4)]
-  assert [done.tolist() for _, _, done, _ in steps] == [[False] * 2] * 2 + [
-    [True] * 2,
-    [False] * 2,
-  ]
-  observation, _, _, infos = steps[2]
-  for world, info in enumerate(infos):
-    assert info["TimeLimit.truncated"] and not info["is_success"]
-    assert info["episode"]["l"] == 3
-    # The hand has opened; in the observation of the next episode it is closed again.
-    last, begun = info["terminal_observation"], observation["robot"][world]
-    assert last["robot"][-1] < first["robot"][world, -1] - 0.1
-    np.testing.assert_allclose(begun[-1], first["robot"][world, -1], atol=1e-3)

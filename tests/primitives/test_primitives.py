@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import io
 import multiprocessing
 import os
@@ -14,6 +15,7 @@ from typing import Any
 from hand_made import SLOW_MJX
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -22,6 +24,7 @@ from apnpql_jax.errors import UserError
 from apnpql_jax.primitives import ik, reset_bank, tracking
 from apnpql_jax.sim import arm, physics
 from apnpql_jax.sim.kinematics import make_kinematics
+from apnpql_jax.sim.scene import load_scene
 from apnpql_jax.tasks.stack_box import StackBox
 from apnpql_jax.tasks.task import ResetDraw
 
@@ -111,6 +114,35 @@ def test_bank_rejects_overlapping_and_unreachable_draws(capsys):
   assert (spots[..., 0] < 0.6).all()
   printed = " ".join(capsys.readouterr().err.split())
   assert "64 drawn; rejected: 22 not at rest, 22 out of reach" in printed
+
+
+@pytest.mark.parametrize("timestep", [0.0025, 0.005])
+def test_draws_settle_for_four_control_periods(timestep):
+  def edit(spec: mujoco.MjSpec) -> None:
+    spec.option.timestep = timestep
+
+  careless = Careless()
+  careless.scene = load_scene(careless.scene.path, variants=[edit])
+  state, _ = reset_bank._settled(
+    careless, np.random.default_rng(0), 3, reset_bank.BankReport()
+  )
+  np.testing.assert_allclose(state.time, physics.START_TIME + 0.6, rtol=1e-5)
+
+
+def test_a_base_class_in_another_file_is_part_of_the_banks_name(tmp_path, monkeypatch):
+  monkeypatch.syspath_prepend(tmp_path)
+  base = tmp_path / "bases.py"
+  base.write_text(
+    "from apnpql_jax.tasks.stack_box import StackBox\nclass Base(StackBox): pass\n"
+  )
+  (tmp_path / "mine.py").write_text(
+    "import abc, bases\nclass Mine(abc.ABC, bases.Base): pass\n"
+  )
+  mine = importlib.import_module("mine").Mine()
+  name = reset_bank._file_name(mine, 16, 0)
+  assert name == reset_bank._file_name(mine, 16, 0)
+  base.write_text(base.read_text() + "# Another draw.\n")
+  assert name != reset_bank._file_name(mine, 16, 0)
 
 
 BUILD = """

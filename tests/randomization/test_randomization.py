@@ -5,20 +5,24 @@ from __future__ import annotations
 import copy
 import dataclasses
 
+from hand_made import painted, randomized
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
+from apnpql_jax.config.files import mjcf_path
 from apnpql_jax.config.ranges import RandomizationConfig
 from apnpql_jax.config.schema import EnvConfig
+from apnpql_jax.envs.cameras import camera_renderer
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.envs.state import EnvState
 from apnpql_jax.randomization.draw import free_bodies
 from apnpql_jax.randomization.randomize import make_randomize
 from apnpql_jax.sim import arm, engines, motors, physics
 from apnpql_jax.sim.kinematics import make_kinematics
+from apnpql_jax.sim.scene import load_scene
 from apnpql_jax.tasks import make_task, task_names
 from apnpql_jax.training.rollout import FILMED, expert_policy, make_player
 
@@ -151,6 +155,19 @@ def test_each_camera_shifts_within_its_own_range(task, drawn, camera, share):
   assert 0.5 * limit < np.abs(shift).max() <= 1.001 * limit
 
 
+def test_a_camera_on_a_stand_shifts_as_one_in_the_world():
+  def add(spec: mujoco.MjSpec) -> None:
+    tripod = spec.worldbody.add_body(name="tripod", pos=[0.0, 1.0, 0.5]).add_body()
+    tripod.add_camera(name="side")
+
+  scene = load_scene(mjcf_path("push_plate"), variants=[add])
+  config = dataclasses.replace(NONE, camera_shift=ALL.camera_shift)
+  shift = np.abs(
+    randomized(scene, config).fields["cam_pos"][:, scene.id("camera", "side")]
+  )
+  assert 0.5 * ALL.camera_shift < shift.max() <= 1.001 * ALL.camera_shift
+
+
 def test_inertia_is_proportional_to_mass(task):
   """Without changes of size or shape; the robot keeps its mass."""
   model = task.scene.model
@@ -161,6 +178,28 @@ def test_inertia_is_proportional_to_mass(task):
   np.testing.assert_allclose(inertia, np.repeat(mass[..., None], 3, -1), rtol=1e-5)
   changed = [model.body(i).name for i in np.flatnonzero(heavy)[np.ptp(mass, 0) > 0.1]]
   assert changed == ["plate"]
+
+
+@pytest.mark.parametrize("variants", [1, 2])
+def test_materials_and_textures_keep_their_color(tmp_path, variants):
+  """Also where variants of the scene have colors of their own."""
+
+  def repaint(spec: mujoco.MjSpec) -> None:
+    spec.geom("goal").rgba = [0.1, 0.2, 0.3, 1]
+
+  path, edits = painted(tmp_path), [lambda _: None, repaint]
+  scene, alone = load_scene(path, variants=edits[:variants]), load_scene(path)
+  states = (
+    randomized(scene, NONE),
+    randomized(scene, dataclasses.replace(NONE, color=1e-6)),
+  )
+  assert "geom_rgba" in states[1].fields
+  for name in ("global", "wrist"):
+    poses = [make_kinematics(scene)(state) for state in states]
+    found = [camera_renderer(CONFIG, scene, name, (72, 96))(x) for x in poses]
+    plain = camera_renderer(CONFIG, alone, name, (72, 96))(poses[0].replace(fields={}))
+    for image in found:
+      assert np.abs(np.asarray(image, int) - np.asarray(plain, int)).max() <= 1
 
 
 def test_geoms_of_the_robot_change_their_color_together(task, drawn):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 import re
 
+import mujoco
 import pytest
 
 from apnpql_jax.config.files import mjcf_path
@@ -99,6 +100,44 @@ def test_a_keyframe_must_be_complete_and_within_the_limits(
   changed = re.sub(r'qpos="[^"]*"', f'qpos="{qpos}"', text)
   with pytest.raises(ConfigError, match=f"keyframe .*{message}"):
     load(tmp_path, changed)
+
+
+def test_the_range_of_a_ball_joint_is_an_angle(tmp_path):
+  """Which is no number of qpos: w is 1 at rest."""
+  lamp = """<worldbody><body><joint type="ball" range="0 0.5"/><geom size="0.1"/></body>
+    </worldbody><keyframe><key qpos="0 0 0 0 0 0 0 0 0 0 1 0 0 0"/></keyframe>"""
+  load(tmp_path, f"<mujoco>{INCLUDE}{lamp}</mujoco>")
+
+
+def becomes_a_cylinder(spec: mujoco.MjSpec) -> None:
+  spec.geom("yellow").type = mujoco.mjtGeom.mjGEOM_CYLINDER
+
+
+def has_another_condim(spec: mujoco.MjSpec) -> None:
+  spec.pairs[-1].condim = 6
+
+
+def has_another_geom(spec: mujoco.MjSpec) -> None:
+  spec.worldbody.add_geom(size=[0.1, 0, 0])
+
+
+def has_other_options(spec: mujoco.MjSpec) -> None:
+  spec.option.timestep = 0.0025
+
+
+@pytest.mark.parametrize(
+  ("edit", "field"),
+  [
+    (becomes_a_cylinder, "geom_type"),
+    (has_another_condim, "pair_dim"),
+    (has_another_geom, "ngeom"),
+    (has_other_options, "opt.timestep"),
+  ],
+)
+def test_variants_must_not_differ_in_what_all_worlds_share(edit, field):
+  variants = [lambda spec: None, edit]
+  with pytest.raises(ConfigError, match=f"stack_box.xml: variants differ in {field}, "):
+    load_scene(mjcf_path("stack_box"), variants=variants)
 
 
 BOX = """<body name="{name}" pos="0.4 0 0.1">{joint}<inertial pos="0 0 0" mass="0.1"

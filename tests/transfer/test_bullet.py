@@ -7,10 +7,12 @@ import sys
 from types import SimpleNamespace
 from typing import Any
 
+from hand_made import painted
 import mujoco
 import numpy as np
 import pytest
 
+from apnpql_jax.colors import geom_rgba
 from apnpql_jax.config.files import mjcf_path
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.robot.limits import TIMESTEP
@@ -23,6 +25,7 @@ from apnpql_jax.tasks.stack_box import SIDE
 from apnpql_jax.transfer import bullet, contacts
 from apnpql_jax.transfer.cell import Cell
 from apnpql_jax.transfer.plant import Plant, with_fields
+from apnpql_jax.transfer.urdf import write
 
 PERIOD_S = 0.15
 FIRST = np.array([0.4, -0.3, 0.3, 0.2, -0.3, 0.4])
@@ -377,6 +380,13 @@ def test_a_missing_package_is_named(cell, option, monkeypatch):
   cure = f"{option} needs PyBullet: pip install 'apnpql-jax\\[transfer\\]'"
   with pytest.raises(ConfigError, match=cure):
     cell.check()
+
+
+def test_links_have_the_colors_of_materials_and_textures(tmp_path):
+  model = load_scene(painted(tmp_path)).model
+  for root, geom in ((model.body("plate").id, "plate_floor"), (0, "crate")):
+    rgb = geom_rgba(model)[model.geom(geom).id, :3]
+    assert 'color rgba="' + " ".join(str(float(x)) for x in rgb) in write(model, root)
 
 
 def test_pybullet_prints_nothing(capfd):

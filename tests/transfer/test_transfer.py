@@ -7,24 +7,27 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+from hand_made import painted
 import imageio.v3 as iio
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from render_oracles import cast_rays
 
 from apnpql_jax import testing
+from apnpql_jax.colors import geom_rgba
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.envs.cameras import make_cameras
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.envs.state import EnvState
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.randomization.randomize import make_randomize
-from apnpql_jax.render import Lighting
+from apnpql_jax.render import Geoms, Lighting
 from apnpql_jax.sim.graphics import area_resized
 from apnpql_jax.sim.physics import START_TIME
-from apnpql_jax.sim.scene import Scene, free_joints
+from apnpql_jax.sim.scene import Scene, free_joints, load_scene
 from apnpql_jax.tasks import make_task
 from apnpql_jax.training import evaluate
 from apnpql_jax.training.rollout import expert_policy, make_player
@@ -178,6 +181,33 @@ def test_background_has_the_color_of_the_ray_caster(renderer):
     _, wrist = gl.draw(poses, {}, row=0, instant=0)
     sky = (np.abs(wrist - expected) < 1).all(-1)
     assert sky.mean() > 0.02 and sky[0].any()
+
+
+@pytest.mark.parametrize("renderer", [OpenGL, Tiny])
+def test_materials_and_textures_have_the_color_of_the_ray_caster(renderer, tmp_path):
+  """With and without colors of the world in place of the model's."""
+  if renderer is Tiny:
+    pytest.importorskip("pybullet")
+  scene = load_scene(painted(tmp_path))
+  model = scene.model
+  data = mujoco.MjData(model)
+  data.qpos[:] = scene.keyframe("neutral")
+  mujoco.mj_forward(model, data)
+  names = "geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat"
+  poses = {name: np.array(getattr(data, name)) for name in names}
+  ids, _, _ = cast_rays(model, data, "global", *CONFIG.global_size)
+  colors = np.asarray(Geoms.from_model(model).colors)
+  rows = Geoms.from_model(model).ids.tolist()
+  for gl in opened(scene, renderer, unseen=()):
+    fields: dict[str, np.ndarray]
+    for fields in ({}, {"geom_rgba": geom_rgba(model)}):
+      image = gl.draw(poses, fields, row=0, instant=0)[0].astype(float)
+      for name in ("crate", "plate_floor"):
+        seen = image[ids == model.geom(name).id]
+        assert len(seen) > 15
+        hue = seen.mean(0) / seen.mean()
+        color = colors[rows.index(model.geom(name).id)]
+        np.testing.assert_allclose(hue, color / color.mean(), atol=0.15)
 
 
 def test_unseen_looks_follow_from_version_and_row(strange, plain, env, state):

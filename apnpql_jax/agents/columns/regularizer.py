@@ -66,7 +66,8 @@ def fit_advantageous(
   """Fits b to replayed actions with Q(s, a) >= E_pi[Q(s, .)] (ABM, Siegel 2020)."""
   del candidates
   samples = batch.action_tm1[None]
-  key = jax.random.fold_in(key, 1)  # Other draws than those of the policy update.
+  # Other draws than those of the policy update, which splits the key in two.
+  key = jax.random.fold_in(key, 2)
   policy = parametric(heads, prior, key, num_samples=heads.config.policy_samples)
   good = heads.q(samples) >= policy.value[None]
   return _fit(heads, prior, samples, good.astype(samples.dtype), nu)

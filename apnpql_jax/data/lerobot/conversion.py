@@ -71,7 +71,7 @@ def convert(folder: Path, scene: Scene, *, period_s: float) -> Demonstrations:
 
 def _exact(dataset: Dataset, scene: Scene, period_s: float) -> Demonstrations:
   """Returns demonstrations from whole states, one control period apart."""
-  if abs(1 / (dataset.fps * period_s) - 1) > _PERIOD_TOLERANCE:
+  if abs(1 / dataset.fps / period_s - 1) > _PERIOD_TOLERANCE:
     raise FileError(
       f"its frames are {1 / dataset.fps:.4g} s apart, not {period_s} s, the control "
       "period of the task"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 import dataclasses
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,9 @@ class Episode:
 
   time: np.ndarray
   """Time since the first frame f64[n], s."""
+
+  period: float
+  """Time between frames, s."""
 
   columns: Mapping[str, np.ndarray]
   """Columns of numbers f64[n, k], by name."""
@@ -59,17 +63,17 @@ class Episode:
     """
     path, begin = self.videos[name]
     left = len(self.time)
-    period = self.time[1] if left > 1 else 1.0
     try:
       with av.open(str(path)) as file:
         for frame in file.decode(video=0):
-          if left and frame.time > begin - 0.5 * period:
+          if frame.time > begin - 0.5 * self.period:
             left -= 1
             yield frame.to_ndarray(format="rgb24")
+          if not left:
+            return
     except (OSError, av.FFmpegError) as error:
       raise FileError(f"cannot read {path}: {one_line(error)}") from None
-    if left:
-      raise FileError(f"{path} lacks {left} of {len(self.time)} frames")
+    raise FileError(f"{path} lacks {left} of {len(self.time)} frames")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,7 +130,10 @@ def _read(folder: Path) -> Dataset:
   }
   path = folder / layout.ABOUT
   about = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-  found = Dataset(float(info["fps"]), vectors, [], about)
+  fps = float(info["fps"])
+  if not 0.0 < fps < math.inf:
+    raise FileError(f"its frames per second are {fps}")
+  found = Dataset(fps, vectors, [], about)
   if not info["total_episodes"]:
     return found
   table = _table(folder / layout.TASKS)
@@ -170,6 +177,10 @@ def _episode(
   columns = {
     key: _numbers(data[key], mine) for key in dataset.names.keys() | {"task_index"}
   }
+  for key, names in dataset.names.items():
+    width = columns[key].shape[1]
+    if [width] != info["features"][key]["shape"] or len(names) > width:
+      raise FileError(f"{key} in {name} has {width} numbers, unlike in {layout.INFO}")
   count = len(columns[ACTION])
   if count != row["length"] or not count:
     raise FileError(
@@ -188,8 +199,8 @@ def _episode(
         file_index=row[f"videos/{key}/file_index"],
       )
       videos[key] = folder / path, float(row[f"videos/{key}/from_timestamp"])
-  time = np.arange(count) / dataset.fps
-  return Episode(task, time, columns, success, videos)
+  time, period = np.arange(count) / dataset.fps, 1.0 / dataset.fps
+  return Episode(task, time, period, columns, success, videos)
 
 
 def _table(path: Path) -> Any:
@@ -207,7 +218,8 @@ def _table(path: Path) -> Any:
 def _names(feature: Json) -> list[str]:
   """Returns the names of a column's numbers, which may be in groups."""
   names = feature.get("names") or []
-  return sum(names.values(), []) if isinstance(names, dict) else list(names)
+  names = sum(names.values(), []) if isinstance(names, dict) else names
+  return [str(name) for name in names]
 
 
 def _numbers(column: Any, rows: np.ndarray) -> np.ndarray:
