@@ -141,14 +141,19 @@ def _read(path: Path, name: str) -> Record:
 
 
 def read_all(run_dir: Path) -> dict[int, Record]:
-  """Returns step -> record, ascending, of each readable checkpoint of a run."""
-  records = {}
-  for step in steps(run_dir):
-    try:
-      records[step] = read(run_dir, step)
-    except UserError:  # Reported when this checkpoint is requested.
-      continue
-  return records
+  """Returns step -> record, ascending, of each readable checkpoint of a run.
+
+  Reads again if a run that is training made or removed a checkpoint meanwhile.
+  """
+  while True:
+    records, listed = {}, steps(run_dir)
+    for step in listed:
+      try:
+        records[step] = read(run_dir, step)
+      except UserError:  # Reported when this checkpoint is requested.
+        continue
+    if steps(run_dir) == listed:
+      return records
 
 
 def steps(run_dir: Path) -> list[int]:

@@ -60,9 +60,7 @@ def find(origin: Path | str, config: TrainConfig) -> tuple[Path, int]:
   """
   run_dir, step = _parse(origin)
   saved = run_folder.open_run(run_dir).config
-  if step is None:
-    step = checkpoint_reader.restore(run_dir, None, {}).step
-  checkpoint_reader.restore(run_dir, step, {})
+  step = checkpoint_reader.restore(run_dir, step, {}).step
   learner = checkpoint_record.read(run_dir, step).items.get("learner", {})
   held = {k: x.kind for k, x in learner.items() if k.split("/")[0] in _PARTS}
   wanted = _kinds(_example(config, None))

@@ -503,6 +503,21 @@ def test_a_run_can_be_read_while_it_saves(tmp_path: Path):
   assert last > 15
 
 
+def test_records_are_read_again_if_a_run_replaces_its_checkpoint(
+  tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+  read = checkpoint_record.read
+  _save(tmp_path, (1, _state(1), 0.5))
+
+  def read_late(run: Path, step: int) -> checkpoint_record.Record:
+    monkeypatch.setattr(checkpoint_record, "read", read)
+    _save(run, (2, _state(2), 0.5), keep=1)
+    return read(run, step)
+
+  monkeypatch.setattr(checkpoint_record, "read", read_late)
+  assert checkpoint_reader.best_step(tmp_path) == 2
+
+
 @pytest.mark.parametrize(
   "moments", [3, pytest.param(20, marks=pytest.mark.slow, id="20")]
 )
