@@ -167,5 +167,7 @@ def _video(video: Path, folder: Path, about: str, *, inside: bool) -> str:
 
 def newest_video(run: Run) -> Path | None:
   """Returns the last video of a run's evaluations, if there is one."""
-  videos = sorted((run.folder / "videos").glob("step_*.mp4")) if run.folder else []
-  return videos[-1] if videos else None
+  paths = (run.folder / "videos").glob("step_*.mp4") if run.folder else ()
+  # Others are being written, or were when their process was killed.
+  whole = (path for path in paths if path.stem.removeprefix("step_").isdecimal())
+  return max(whole, default=None)

@@ -130,12 +130,17 @@ def _final(path: Path, evaluations: Sequence[Row]) -> dict[str, Any] | None:
 
 
 def _json(path: Path) -> dict[str, Any] | None:
-  """Returns the object in a small JSON file; None if there is no file."""
+  """Returns the object in a small JSON file; None if there is no file or it is empty.
+
+  ``apnpql evaluate RUN --json > RUN/evaluation.json`` leaves it empty until it ends.
+  """
   if not path.is_file():
     return None
   try:
     with path.open("rb") as file:
-      data = json.loads(file.read(_MAX_BYTES))
+      if not (text := file.read(_MAX_BYTES)):
+        return None
+    data = json.loads(text)
   except (OSError, ValueError, RecursionError) as error:
     raise FileError(f"{path} cannot be read: {error}") from None
   if not isinstance(data, dict):

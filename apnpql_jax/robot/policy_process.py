@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from apnpql_jax.errors import FileError, one_line
 from apnpql_jax.robot import devices, policy_folder
 from apnpql_jax.robot.blackboard import Blackboard, Phase, text
 from apnpql_jax.robot.devices import Robot
@@ -50,8 +51,6 @@ def load_program(folder: PolicyFolder, seed: int) -> Act:
   runtime.configure()
   import jax
   from jax import export
-
-  from apnpql_jax.errors import FileError, one_line
 
   try:
     call = jax.jit(export.deserialize(bytearray(folder.program.read_bytes())).call)
@@ -112,6 +111,8 @@ def main(
 
   try:
     folder = policy_folder.load(Path(options["policy"]))
+    if folder.contract != robot.contract:
+      raise FileError(f"{str(folder.path)!r} was replaced meanwhile; start again")
     if options["replay"] is None:
       act = load_program(folder, options["seed"])
     else:

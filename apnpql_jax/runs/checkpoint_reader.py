@@ -124,7 +124,10 @@ def _restore(
   record = checkpoint_record.read(run_dir, step)
   saved = config and _config(title(run_dir, step), record.config, config)
   wanted = examples if isinstance(examples, Mapping) else examples(saved)
-  steps = {name: _step_with(run_dir, step, name) for name in wanted}
+  steps = {
+    name: step if name in record.items else _step_with(run_dir, step, name)
+    for name in wanted
+  }
   items = {
     name: _restore_item(run_dir, steps[name], name, example, partly, lost)
     for name, example in wanted.items()

@@ -147,8 +147,11 @@ def metric_files(run_dir: Path) -> list[Path]:
 def read_evaluations(run_dir: Path) -> list[Row]:
   """Returns the rows of all evaluations of a run, oldest first."""
   key = json.dumps(SUCCESS)
-  rows = (row for path in metric_files(run_dir) for row in read_rows(path, having=key))
-  return [row for row in rows if row.get(SUCCESS) is not None]
+  while True:
+    files = metric_files(run_dir)
+    rows = [row for path in files for row in read_rows(path, having=key)]
+    if metric_files(run_dir) == files:  # A run that is training renames them.
+      return [row for row in rows if row.get(SUCCESS) is not None]
 
 
 def _numbered(path: Path, number: int) -> Path:
@@ -165,10 +168,12 @@ def read_rows(path: Path, *, having: str = "", skip_damaged: bool = False) -> li
     FileError: A line other than an incomplete last one is not a row, and
       ``skip_damaged`` is not set.
   """
-  if not path.exists():
+  try:
+    opened = path.open(encoding="utf-8", errors="replace")
+  except FileNotFoundError:
     return []
   rows = []
-  with path.open(encoding="utf-8", errors="replace") as file:
+  with opened as file:
     for number, line in enumerate(file, start=1):
       if not line.endswith("\n"):
         break

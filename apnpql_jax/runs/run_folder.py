@@ -81,6 +81,10 @@ def create(
       old.rename(run_dir)
     shutil.rmtree(new, ignore_errors=True)
     raise FileError(f"cannot make run folder {str(run_dir)!r}: {error}") from None
+  with contextlib.suppress(OSError):
+    (
+      old / CONFIG_FILE
+    ).unlink()  # From now on it is no run, however long the rest takes.
   shutil.rmtree(old, ignore_errors=True)
   return RunFolder(run_dir, config)
 

@@ -62,7 +62,15 @@ class Manifest:
     return Work(entry.name, entry.argv, self.run_dir(entry), log)
 
   def refresh(self) -> None:
-    """Takes from the run folders what is done; the rest waits, to be started again."""
+    """Takes from the run folders what is done; the rest waits, to be started again.
+
+    Takes jobs and attempts from the file, which another process may have saved since.
+    """
+    path = self.folder / MANIFEST_FILE
+    saved = {run.name: run for run in load(self.folder).runs} if path.exists() else {}
+    for index, entry in enumerate(self.runs):
+      if (newer := saved.get(entry.name)) and newer.argv == entry.argv:
+        self.runs[index] = newer
     for entry in self.runs:
       entry.state = DONE if self._finished(entry) else WAITING
 

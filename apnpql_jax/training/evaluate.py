@@ -25,7 +25,7 @@ from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.primitives import reset_bank
 from apnpql_jax.runs import abandoned_tasks, checkpoint_reader, leaves, run_folder
 from apnpql_jax.runs.metrics import wilson_interval
-from apnpql_jax.tasks import Task
+from apnpql_jax.tasks import Task, make_task
 from apnpql_jax.training.rollout import (
   Episodes,
   Player,
@@ -162,13 +162,15 @@ def load_trained(
   config = run_folder.open_run(run_dir).config
   env_config = dataclasses.replace(config.env, backend=backend or config.env.backend)
   check_env(env_config)
-  checkpoint_reader.restore(run_dir, step, {}, config=config)  # Fails early.
+  devices.start()
+  # First, because a run that is training may remove the checkpoint meanwhile.
+  loaded = load_agent(run_dir, config, make_task(config.env.task), step=step)
   if bank_seed != reset_bank.SEED:
     rows = max(MIN_BANK_ROWS, math.ceil(held_out / HELD_OUT_SHARE))
     env_config = dataclasses.replace(env_config, bank_rows=rows)
   instants = config.agent.lstm_instants
   env = make_env(env_config, instants=instants, bank_seed=bank_seed)
-  return Trained(config, env, *load_agent(run_dir, config, env.task, step=step))
+  return Trained(config, env, *loaded)
 
 
 def load_agent(

@@ -25,9 +25,10 @@ from apnpql_jax.console import reporting
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.envs.state import EnvState
 from apnpql_jax.errors import ConfigError, check_name
-from apnpql_jax.runs import checkpoint_reader, run_folder
+from apnpql_jax.runs import run_folder
 from apnpql_jax.runs.metrics import wilson_interval
 from apnpql_jax.sim.physics import PhysicsState
+from apnpql_jax.tasks import make_task
 from apnpql_jax.training.diagnose import end_of
 from apnpql_jax.training.evaluate import (
   check_count,
@@ -90,15 +91,17 @@ def transfer(
     raise ConfigError(
       f"{run_dir} was trained with --obs {config.env.obs}; transfer needs pixels"
     )
-  checkpoint_reader.restore(run_dir, step, {}, config=config)  # Fails early.
+  devices.start()
+  # First, because a run that is training may remove the checkpoint meanwhile.
+  task = make_task(config.env.task)
+  agent, params, step = load_agent(run_dir, config, task, step=step)
+  conditions = of_run(
+    run_dir, config, step, cell, acting=acting, episodes=episodes, seed=seed
+  )
   instants = config.agent.lstm_instants
   outside = cell.renderer != "rays"
   obs = "state" if outside else "pixels"  # Others draw the images.
   env = _make_env(config.env, cell, obs, instants=0 if outside else instants)
-  agent, params, step = load_agent(run_dir, config, env.task, step=step)
-  conditions = of_run(
-    run_dir, config, step, cell, acting=acting, episodes=episodes, seed=seed
-  )
   rule = conditions["acting"]
   choose = jax.jit(lambda p, seen, key: agent.act(p, seen, key, acting=rule)[0])
 

@@ -74,7 +74,9 @@ class Browser:
   def offer(self, steps: list[int]) -> None:
     """See ``View.offer``."""
     self.checkpoint.visible = bool(steps)
-    self.checkpoint.options = (NEWEST, *map(str, steps))
+    chosen, offered = self.checkpoint.value, (NEWEST, *map(str, steps))
+    # The dropdown would choose another if the run has removed the chosen one.
+    self.checkpoint.options = offered if chosen in offered else (*offered, chosen)
 
   def state(self, *, playing: bool) -> None:
     """See ``View.state``."""

@@ -127,7 +127,7 @@ def plot_growth(report: Report, out: Path) -> None:
     panel.set_xlabel(reports.UNITS.get(axis, axis))
     panel.legend()
   for panel in panels[:, 0]:
-    panel.set_ylabel("s")
+    panel.set_ylabel("time, s")
   figure.savefig(out, dpi=120)
 
 

@@ -14,7 +14,9 @@ import av
 import numpy as np
 import pytest
 
+from apnpql_jax.atomic import replacing
 from apnpql_jax.data import lerobot
+from apnpql_jax.data.lerobot import layout
 from apnpql_jax.data.lerobot.video import Video
 from apnpql_jax.errors import ConfigError, FileError, UserError
 
@@ -243,6 +245,14 @@ os.kill(os.getpid(), signal.SIGKILL)
   dataset = lerobot.read(folder)
   assert [len(x.time) for x in dataset.episodes] == [4, 4]
   assert len([*dataset.episodes[1].images(SMALL)]) == 4
+
+
+def test_a_table_that_was_being_written_is_left_out(written, tmp_path):
+  folder = shutil.copytree(written[0], tmp_path / "dataset")
+  table = folder / layout.EPISODES.format(**layout.place(0))
+  with replacing(table.with_stem("file-003")) as part:
+    part.write_bytes(table.read_bytes()[:100])
+    assert len(lerobot.read(folder).episodes) == 3
 
 
 def test_an_unfinished_episode_leaves_nothing(tmp_path):

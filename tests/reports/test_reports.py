@@ -16,6 +16,7 @@ import pytest
 from run_files import EPISODES, make_run
 from scipy import stats
 
+from apnpql_jax.atomic import replacing
 from apnpql_jax.errors import FileError, UserError
 from apnpql_jax.reports import figure, groups, page, reading, statistics, tables
 from apnpql_jax.runs.metrics import wilson_interval
@@ -149,6 +150,25 @@ def test_the_evaluation_after_training_counts_instead_of_the_last_one(tmp_path):
   (folder / "evaluation.json").write_text(json.dumps(final))
   run = reading.read(folder)
   assert statistics.last([run]).mean == 0.75 and tables.solved([run]) == "150 of 200"
+
+
+def test_an_evaluation_that_has_not_ended_does_not_count(tmp_path):
+  """The shell has made its file, which is empty until it ends."""
+  folder = make_run(tmp_path / "a", [0.5])
+  (folder / "evaluation.json").touch()
+  assert tables.solved([reading.read(folder)]) == "25 of 50"
+
+
+def test_a_video_that_is_being_written_is_not_the_newest(tmp_path):
+  (run,) = reading.find([make_run(tmp_path / "a", [0.5])])
+  assert run.folder is not None
+  (run.folder / "videos").mkdir()
+  whole = run.folder / "videos" / "step_00003000.mp4"
+  for path in (whole, whole.with_stem("step_00001000")):
+    path.touch()
+  with replacing(whole) as part:
+    part.touch()
+    assert page.newest_video(run) == whole
 
 
 def test_an_evaluation_counts_if_all_runs_have_one_that_is_not_older(tmp_path, capfd):

@@ -172,6 +172,29 @@ def compiling(peer: Any) -> None:
   never.wait(100.0)
 
 
+def test_a_policy_that_was_replaced_after_it_was_checked_is_not_played(folder):
+  checked = policy_folder.load(folder / "policy").contract | {"task": "another"}
+  options = {"policy": str(folder / "policy"), "seed": 0, "log": None, "replay": None}
+  process = functools.partial(
+    policy_process.main, Robot("double", checked, Cell(), CLOCK), options=options
+  )
+  context = get_context("spawn")
+  ours, theirs = context.Pipe()
+  with Blackboard() as board:
+    played = context.Process(
+      target=process, kwargs={"board_name": board.name, "peer": theirs}
+    )
+    played.start()
+    try:
+      assert ours.poll(60)
+      assert "was replaced" in ours.recv()
+    finally:
+      ours.close()
+      theirs.close()
+      played.join(60)
+  assert not played.is_alive()
+
+
 def test_a_policy_that_compiles_ends_at_once_with_the_control_process():
   context = get_context("spawn")
   ours, theirs = context.Pipe()

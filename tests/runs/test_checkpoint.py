@@ -503,6 +503,25 @@ def test_a_run_can_be_read_while_it_saves(tmp_path: Path):
   assert last > 15
 
 
+def test_weights_of_a_checkpoint_that_a_run_removes_are_not_those_of_another(
+  tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+  """The best checkpoint stays, and would have all items."""
+  read = checkpoint_record.read
+  _save(tmp_path, (1, _state(1), 0.9), (2, _state(2), 0.5), keep=1)
+
+  def read_early(run: Path, step: int) -> checkpoint_record.Record:
+    monkeypatch.setattr(checkpoint_record, "read", read)
+    record = read(run, step)
+    _save(run, (3, _state(3), 0.5), keep=1)
+    return record
+
+  monkeypatch.setattr(checkpoint_record, "read", read_early)
+  found = checkpoint_reader.restore(tmp_path, None, {"state": _state()})
+  assert checkpoint_reader.all_steps(tmp_path) == [1, 3] and found.step == 3
+  _assert_same_bits(found.items["state"], _state(3))
+
+
 def test_records_are_read_again_if_a_run_replaces_its_checkpoint(
   tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -12,6 +12,7 @@ import pty
 import struct
 import sys
 import time
+from typing import Any
 
 from hypothesis import given, settings, strategies as st
 import imageio.v3 as iio
@@ -303,6 +304,21 @@ def test_the_curve_band_is_the_wilson_interval():
   expected = stats.binomtest(34, 40).proportion_ci(method="wilson")
   np.testing.assert_allclose(metrics._interval(row), expected, rtol=1e-9)
   assert metrics._interval({"step": 1, metrics.SUCCESS: 0.85}) == (0.85, 0.85)
+
+
+def test_evaluations_are_read_again_if_the_run_renames_its_file(tmp_path, monkeypatch):
+  row = {metrics.STEP: 1, metrics.SUCCESS: 0.5}
+  path = tmp_path / "metrics.jsonl"
+  path.write_text(json.dumps(row) + "\n")
+  read = metrics.read_rows
+
+  def read_late(*args: Any, **options: Any) -> list[metrics.Row]:
+    monkeypatch.setattr(metrics, "read_rows", read)
+    path.rename(tmp_path / "metrics.1.jsonl")
+    return read(*args, **options)
+
+  monkeypatch.setattr(metrics, "read_rows", read_late)
+  assert metrics.read_evaluations(tmp_path) == [row]
 
 
 def test_progress_prints_plain_lines_where_there_is_no_terminal(capsys):

@@ -6,6 +6,7 @@ import dataclasses
 import json
 from pathlib import Path
 import platform
+import shutil
 import subprocess
 import sys
 
@@ -14,6 +15,7 @@ import pytest
 
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.errors import UserError
+from apnpql_jax.reports import reading
 from apnpql_jax.runs import provenance, run_folder, text
 from apnpql_jax.runs.provenance import changed_versions
 
@@ -92,6 +94,14 @@ def test_a_run_is_replaced_only_when_asked(tmp_path: Path):
   assert run_folder.open_run(run).config == other
   assert not (run / "metrics.jsonl").exists()
   assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_a_replaced_run_that_could_not_be_removed_is_no_run(tmp_path, monkeypatch):
+  run_folder.create(tmp_path / "run", CONFIG)
+  monkeypatch.setattr(shutil, "rmtree", lambda *args, **options: None)
+  run_folder.create(tmp_path / "run", CONFIG, overwrite=True)
+  assert len([*tmp_path.iterdir()]) == 2
+  assert [run.name for run in reading.find([tmp_path])] == ["run"]
 
 
 def test_a_folder_other_than_a_run_is_never_removed(tmp_path: Path):

@@ -89,6 +89,18 @@ def test_a_failed_run_costs_the_others_nothing_and_is_retried(tmp_path):
   assert (second.state, second.attempts) == (states.DONE, 1)
 
 
+def test_what_another_process_has_saved_meanwhile_is_kept(tmp_path):
+  """A job that it left on a cluster is taken over rather than started again."""
+  program = f"open({str(tmp_path / 'started')!r}, 'x')"
+  sweep = sweep_of(tmp_path, program)
+  meanwhile = sweep_of(tmp_path, program)
+  meanwhile.runs[0].attempts, meanwhile.runs[0].job = 3, "17"
+  meanwhile.save()
+  run(sweep)
+  (entry,) = states.load(tmp_path).runs
+  assert entry.attempts == 4 and (tmp_path / "started").exists()
+
+
 def test_a_run_that_cannot_be_started_costs_the_others_nothing(tmp_path):
   sweep = sweep_of(tmp_path, "", "")
   (tmp_path / "a.log").mkdir()

@@ -9,6 +9,7 @@ import inspect
 import json
 from pathlib import Path
 import shutil
+from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
@@ -17,9 +18,10 @@ import pytest
 from apnpql_jax import testing
 from apnpql_jax.cli.options import Evaluate
 from apnpql_jax.config.schema import TrainConfig
+from apnpql_jax.envs.env import Env
 from apnpql_jax.errors import ConfigError, FileError, UserError
 from apnpql_jax.runs import checkpoint_reader, run_folder
-from apnpql_jax.training import reporter
+from apnpql_jax.training import evaluate as evaluation, reporter
 from apnpql_jax.training.evaluate import evaluate
 from apnpql_jax.training.train import train
 from apnpql_jax.training.video import HOLD
@@ -159,6 +161,21 @@ def test_evaluate_plays_from_states_of_another_bank(finished):
   assert all(figures["episodes"] == 3 for figures in played)
   lengths = [figures["mean_length"] for figures in played]
   assert lengths[0] == lengths[1]
+
+
+def test_a_checkpoint_is_read_before_the_run_may_remove_it(
+  finished, tmp_path, monkeypatch
+):
+  """The worlds can take minutes, in which a run that is training saves others."""
+  run = shutil.copytree(finished[0], tmp_path / "run")
+  make_env = evaluation.make_env
+
+  def make_slowly(*args: Any, **options: Any) -> Env:
+    shutil.rmtree(run / "checkpoints" / "32")
+    return make_env(*args, **options)
+
+  monkeypatch.setattr(evaluation, "make_env", make_slowly)
+  assert evaluation.load_trained(run, backend=None, step=32).step == 32
 
 
 @pytest.mark.parametrize(

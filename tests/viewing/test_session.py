@@ -124,6 +124,10 @@ def test_the_server_shows_frames_to_this_machine_only(player):
       wait_until(lambda: len(view.checkpoint.options) > 1)
       view.checkpoint.value = view.checkpoint.options[-1]
       wait_until(lambda: str(player.actor.step) == view.checkpoint.options[-1])
+      # The run removes it: it stays, and so does the episode.
+      chosen = view.checkpoint.value
+      view.offer(player.actor.steps()[:-1])
+      assert view.checkpoint.value == chosen == view.checkpoint.options[-1]
       view.checkpoint.value = browser.NEWEST
       wait_until(lambda: str(player.actor.step) == view.checkpoint.options[1])
   finally:

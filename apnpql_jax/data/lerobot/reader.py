@@ -143,7 +143,7 @@ def _read(folder: Path) -> Dataset:
   )
   rows = [
     row
-    for path in sorted((folder / "meta/episodes").glob("*/*.parquet"))
+    for path in sorted(folder.glob(layout.ALL_EPISODES))
     for row in _table(path).to_pylist()
   ]
   files: dict[str, Any] = {}
