@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Container, Iterable, Mapping, Sequence
 import json
 import operator
+import os
 from pathlib import Path
 from typing import Any, NamedTuple
 import zlib
@@ -158,9 +159,13 @@ def read_all(run_dir: Path) -> dict[int, Record]:
 
 def steps(run_dir: Path) -> list[int]:
   """Returns the steps of the complete checkpoints of a run, ascending."""
-  from orbax.checkpoint import utils
-
-  return sorted(utils.checkpoint_steps(folder(run_dir)))
+  # One call, because a run that is training may remove what is looked at later. Orbax
+  # renames a checkpoint to its step when it is complete.
+  try:
+    names = os.listdir(folder(run_dir))
+  except FileNotFoundError:
+    return []
+  return sorted(int(name) for name in names if name.isdecimal())
 
 
 def folder(run_dir: Path) -> Path:

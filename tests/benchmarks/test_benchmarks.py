@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+import types
 from typing import Any
 
 import jax
@@ -177,11 +178,12 @@ def test_the_floor_is_the_slower_of_computing_and_moving(monkeypatch):
   assert floor.Work(20.0, 500.0).seconds() == 5.0
 
 
-def test_times_are_of_one_unit_and_programs_take_turns():
-  calls = []
+def test_times_are_of_one_unit_and_programs_take_turns(monkeypatch):
+  calls, now = [], 0.0
 
   def nap(name: str, seconds: float) -> jax.Array:
-    time.sleep(seconds)
+    nonlocal now
+    now += seconds
     calls.append(name)
     return jnp.zeros(())
 
@@ -189,12 +191,13 @@ def test_times_are_of_one_unit_and_programs_take_turns():
     "one": timing.Ready(functools.partial(nap, "one", 0.01), floor_s=0.005),
     "ten": timing.Ready(functools.partial(nap, "ten", 0.04), floor_s=0.001, units=10),
   }
+  clock = types.SimpleNamespace(perf_counter=lambda: now, process_time=lambda: now)
+  monkeypatch.setattr(timing, "time", clock)
   times = timing.measure(ready, repeats=3, seconds=0.03)
   one, ten = times["one"], times["ten"]
   assert len(one.wall) == len(ten.wall) == 3
-  assert 0.01 <= one.seconds < 0.03
-  assert 0.004 <= ten.seconds < 0.012
-  assert one.per(10).seconds == pytest.approx(one.seconds / 10)
+  assert one.seconds == pytest.approx(0.01) and ten.seconds == pytest.approx(0.004)
+  assert one.per(10).seconds == pytest.approx(0.001)
   # Two calls of each that do not count, then three rounds.
   taken = [name for name, _ in itertools.groupby(calls)]
   assert taken == ["one", "ten"] * 4 and calls.count("ten") == 5
@@ -205,7 +208,7 @@ def test_times_are_of_one_unit_and_programs_take_turns():
 
 def test_measuring_waits_for_compilation(tmp_path, monkeypatch):
   monkeypatch.setenv(turns.FOLDER, str(tmp_path))
-  events, compiling = [], threading.Event()
+  events, compiling = [], threading.Barrier(3)
 
   def measure() -> None:
     with turns.turn():
@@ -213,14 +216,14 @@ def test_measuring_waits_for_compilation(tmp_path, monkeypatch):
 
   def compile_slowly() -> None:
     with turns.turn(shared=True):
-      compiling.set()
+      compiling.wait(10)
       time.sleep(0.2)
       events.append("compiled")
 
   threads = [threading.Thread(target=compile_slowly) for _ in range(2)]
   for thread in threads:
     thread.start()
-  assert compiling.wait(10)
+  compiling.wait(10)
   threads.append(threading.Thread(target=measure))
   threads[-1].start()
   for thread in threads:

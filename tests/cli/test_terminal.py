@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 from pathlib import Path
-import pty
 import re
-import struct
 import subprocess
 import sys
-import termios
 
 import pytest
+from terminals import read_all, terminal
 
 from apnpql_jax.cli import main, text
 
@@ -23,24 +20,17 @@ ENV = os.environ | {"PYTHONPATH": str(ROOT), "TERM": "xterm-256color"}
 
 def on_terminal(*args: str, columns: int, **env: str) -> str:
   """Returns what a command prints on a terminal of this width."""
-  controller, terminal = pty.openpty()
-  fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+  controller, end = terminal(columns)
   process = subprocess.Popen(
     [sys.executable, "-m", "apnpql_jax", *args],
-    stdout=terminal,
-    stderr=terminal,
+    stdout=end,
+    stderr=end,
     env={k: x for k, x in (ENV | env).items() if k != "COLUMNS"},
   )
-  os.close(terminal)
-  shown = b""
-  try:
-    while part := os.read(controller, 1 << 16):
-      shown += part
-  except OSError:  # The process has ended.
-    pass
-  os.close(controller)
+  os.close(end)
+  text = read_all(controller)
   assert process.wait() == 0
-  return shown.decode()
+  return text
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -10,13 +10,12 @@ from apnpql_jax.robot.drivers import buses
 
 
 @pytest.fixture(autouse=True)
-def patience(request, monkeypatch) -> None:
-  """Lets the driver of the gripper wait longer, unless a test is about its silence.
+def patience(monkeypatch) -> None:
+  """Lets the driver of the gripper wait longer.
 
   On a busy machine doubles answer late, which is not what most tests are about.
   """
-  if "silent" not in request.node.name:
-    monkeypatch.setattr(buses, "ATTEMPTS", 20)
+  monkeypatch.setattr(buses, "ATTEMPTS", 20)
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from unittest import mock
 import mujoco
 import numpy as np
 import pytest
-from test_processes import CLOCK, NEUTRAL, is_done, rig, speed, until
+from test_processes import CLOCK, rig, speed, start_motion, until
 
 from apnpql_jax.data import lerobot
 from apnpql_jax.errors import DeviceError
@@ -34,51 +34,48 @@ from apnpql_jax.robot.simulated import process as simulation
 from apnpql_jax.robot.supervisor import CAMERAS, Mode
 from apnpql_jax.testing import export_untrained
 
-FRAMES = 8
+CONTEXT = get_context("spawn")
 FAULT = "camera wrist: sent no frame for 0.2 s: check its cable"
 
 
 class Camera:
-  """A camera that is unplugged after some frames."""
+  """A camera that can be unplugged."""
 
-  def __init__(self, clock: Clock, view: dict[str, Any], frames: int):
-    self._clock, self._left = clock, frames
+  def __init__(self, clock: Clock, view: dict[str, Any], unplugged: Any = None):
+    self._clock, self._unplugged = clock, unplugged
     self._image = np.zeros((view["height"], view["width"], 3), np.uint8)
 
   def describe(self) -> dict[str, Any]:
     return {"serial_number": f"{self._image.shape[0]} rows"}
 
   def get_observation(self) -> Frame:
-    self._left -= 1
-    if self._left < 0:
+    if self._unplugged and self._unplugged.is_set():
       raise DeviceError(FAULT)
     return Frame(self._clock.now(), self._image)
-
-
-class FullDisk(Recorder):
-  """A log that the system refuses to write any more when an episode ends."""
-
-  def end_episode(self, success: bool | None) -> int | None:
-    resource.setrlimit(resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
-    return super().end_episode(success)
 
 
 def policy(
   folder: Path,
   log: str,
-  frames: int,
-  recorder: type[Recorder],
+  unplugged: Any,
+  full: Any,
   board_name: str,
   peer: Any,
   clock: Clock,
 ) -> None:
-  """Runs the policy process with such cameras."""
+  """Runs the policy process, with cameras and a disk that fail at an event."""
   contract = policy_folder.load(folder / "policy").contract
 
   @contextlib.contextmanager
   def cameras(robot: Robot) -> Generator[tuple[list[Camera], None]]:
-    views, most = robot.contract["cameras"], 1 + frames  # One before the first.
-    yield [Camera(clock, views[x], most) for x in CAMERAS], None
+    views = robot.contract["cameras"]
+    yield [Camera(clock, views[x], unplugged) for x in CAMERAS], None
+
+  class Log(Recorder):
+    def end_episode(self, success: bool | None) -> int | None:
+      if full.is_set():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
+      return super().end_episode(success)
 
   options = {
     "policy": str(folder / "policy"),
@@ -89,7 +86,7 @@ def policy(
   robot = Robot("double", contract, Cell(), clock)
   with (
     mock.patch.object(devices, "open_cameras", cameras),
-    mock.patch.object(policy_process, "Recorder", recorder),
+    mock.patch.object(policy_process, "Recorder", Log),
   ):
     policy_process.main(robot, board_name, options, peer)
 
@@ -101,7 +98,7 @@ def folder(tmp_path_factory) -> Path:
   made = tmp_path_factory.mktemp("policy-process")
   contract = export_untrained(made / "policy", time_limit_s=30.0)
   views = contract["cameras"]
-  images = [Camera(CLOCK, views[x], 1).get_observation() for x in CAMERAS]
+  images = [Camera(CLOCK, views[x]).get_observation() for x in CAMERAS]
   state: dict[str, Any] = dict.fromkeys(("position", "command", "wrench"), np.zeros(6))
   state |= dict.fromkeys(("gripper", "time", "gripper_time"), 0.0)
   action = np.array([1.0, 0, 0, 0, 0, 0, 1])
@@ -114,12 +111,15 @@ def folder(tmp_path_factory) -> Path:
 
 def test_an_unplugged_camera_stops_the_arm_and_its_episode_is_in_the_log(folder):
   contract = policy_folder.load(folder / "policy").contract
-  target = functools.partial(policy, folder, "log", FRAMES, Recorder)
+  unplugged, full = CONTEXT.Event(), CONTEXT.Event()
+  target = functools.partial(policy, folder, "log", unplugged, full)
   with (
     rig(target, contract) as (board, run),
     Blackboard(run.plant, simulation.RECORDS) as plant,
   ):
-    begin_episode(board)
+    until(lambda: bool(board["policy"].read()["ready"]))
+    order = start_motion(board)
+    unplugged.set()
     until(lambda: text(board["policy"].read()["error"]) == FAULT)
     assert speed(plant) > 0.3
     assert until(lambda: speed(plant) < 0.01) < 0.5
@@ -127,7 +127,7 @@ def test_an_unplugged_camera_stops_the_arm_and_its_episode_is_in_the_log(folder)
     state, found = board["state"].read(), board["policy"].read()
     assert (state["mode"], text(state["reason"])) == (Mode.STOP, FAULT)
     assert state["at_rest"] and FAULT in run.reasons()
-    assert (found["ended"], found["index"], found["over"]) == (2, 0, 0)
+    assert (found["ended"], found["over"]) == (order, 0)
   log, views = lerobot.read(folder / "log"), contract["cameras"]
   assert log.about["devices"] == {
     "robot": "double",
@@ -135,33 +135,26 @@ def test_an_unplugged_camera_stops_the_arm_and_its_episode_is_in_the_log(folder)
     "gripper": {"model": "simulated RH-P12-RN"},
     "cameras": {x: {"serial_number": f"{views[x]['height']} rows"} for x in CAMERAS},
   }
-  (kept,) = log.episodes
-  assert len(kept.actions) == found["actions"] == FRAMES
-  assert kept.success is None
+  assert len(log.episodes) == found["index"] + 1
+  assert len(log.episodes[-1].actions) == found["actions"] > 0
+  assert log.episodes[-1].success is None
 
 
 def test_a_disk_that_fills_ends_the_session_with_one_line(folder):
   contract = policy_folder.load(folder / "policy").contract
-  target = functools.partial(policy, folder, "full", 1000, FullDisk)
+  unplugged, full = CONTEXT.Event(), CONTEXT.Event()
+  target = functools.partial(policy, folder, "full", unplugged, full)
   with rig(target, contract) as (board, run):
-    begin_episode(board)
-    until(lambda: board["policy"].read()["actions"] >= 3)
-    board["order"].write({"number": 3, "phase": Phase.IDLE})
+    until(lambda: bool(board["policy"].read()["ready"]))
+    order = start_motion(board)
+    full.set()
+    board["order"].write({"number": order + 1, "phase": Phase.IDLE})
     until(lambda: not run.control.is_alive() and not run.policy.is_alive())
     state, found = board["state"].read(), board["policy"].read()
     error = text(found["error"])
     assert "full" in error and "File too large" in error and "\n" not in error
-    assert state["at_rest"] and (found["ended"], found["index"]) == (0, -1)
-  assert lerobot.read(folder / "full").episodes == []
-
-
-def begin_episode(board: Blackboard) -> None:
-  """Homes the arm, and begins an episode as order 2."""
-  until(lambda: bool(board["policy"].read()["ready"]))
-  home = {"number": 1, "phase": Phase.HOME, "target": NEUTRAL, "close": 1}
-  board["order"].write(home)
-  until(lambda: is_done(board, 1))
-  board["order"].write({"number": 2, "phase": Phase.PLAY})
+    assert state["at_rest"] and found["ended"] < order
+  assert len(lerobot.read(folder / "full").episodes) == found["index"] + 1
 
 
 def compiling(peer: Any) -> None:
@@ -178,10 +171,9 @@ def test_a_policy_that_was_replaced_after_it_was_checked_is_not_played(folder):
   process = functools.partial(
     policy_process.main, Robot("double", checked, Cell(), CLOCK), options=options
   )
-  context = get_context("spawn")
-  ours, theirs = context.Pipe()
+  ours, theirs = CONTEXT.Pipe()
   with Blackboard() as board:
-    played = context.Process(
+    played = CONTEXT.Process(
       target=process, kwargs={"board_name": board.name, "peer": theirs}
     )
     played.start()
@@ -196,9 +188,8 @@ def test_a_policy_that_was_replaced_after_it_was_checked_is_not_played(folder):
 
 
 def test_a_policy_that_compiles_ends_at_once_with_the_control_process():
-  context = get_context("spawn")
-  ours, theirs = context.Pipe()
-  process = context.Process(target=compiling, args=(theirs,))
+  ours, theirs = CONTEXT.Pipe()
+  process = CONTEXT.Process(target=compiling, args=(theirs,))
   process.start()
   theirs.close()
   ours.close()

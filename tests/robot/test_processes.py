@@ -134,8 +134,8 @@ def until(condition: Callable[[], bool], seconds: float = 120.0) -> float:
   return (time.monotonic() - begin) / CLOCK.slowdown
 
 
-def start_motion(board: Blackboard) -> None:
-  """Homes the arm, and returns when the policy moves it.
+def start_motion(board: Blackboard) -> int:
+  """Homes the arm, and returns the number of the order when the policy moves it.
 
   A busy machine may starve a process for so long that a limit stops the arm, which is
   not what these tests are about. So it tries again.
@@ -149,7 +149,7 @@ def start_motion(board: Blackboard) -> None:
       board["order"].write({"number": number + 1, "phase": Phase.PLAY})
       until(lambda n=number: is_fast(board) or is_done(board, n + 1))
       if is_fast(board):
-        return
+        return number + 1
     reasons.append(text(board["state"].read()["reason"]))
   raise AssertionError(f"the arm stopped: {reasons}")
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import dataclasses
 import gc
 import json
+import os
 from pathlib import Path
 import resource
 import shutil
@@ -486,10 +487,12 @@ def test_a_run_can_be_read_while_it_saves(tmp_path: Path):
     command, cwd=here.parents[1], stdout=subprocess.DEVNULL
   ) as process:
     try:
-      while checkpoint_reader.latest_step(run) is None:
+      while (last := checkpoint_reader.latest_step(run)) is None:
+        assert process.poll() is None
         time.sleep(0.1)
-      last = checkpoint_reader.latest_step(run) or 0
-      for _ in range(15):
+      first = last
+      while last <= first + 15:
+        assert process.poll() is None
         for _ in range(10):
           assert run_folder.open_run(run).config == CONFIG
           assert checkpoint_reader.latest_step(run)
@@ -500,7 +503,6 @@ def test_a_run_can_be_read_while_it_saves(tmp_path: Path):
         last = found.step
     finally:
       process.kill()
-  assert last > 15
 
 
 def test_weights_of_a_checkpoint_that_a_run_removes_are_not_those_of_another(
@@ -520,6 +522,24 @@ def test_weights_of_a_checkpoint_that_a_run_removes_are_not_those_of_another(
   found = checkpoint_reader.restore(tmp_path, None, {"state": _state()})
   assert checkpoint_reader.all_steps(tmp_path) == [1, 3] and found.step == 3
   _assert_same_bits(found.items["state"], _state(3))
+
+
+def test_a_checkpoint_that_replaces_the_only_one_is_seen(
+  tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+  """The listing is from before, and the folders are looked at afterwards."""
+  listdir = os.listdir
+  _save(tmp_path, (1, _state(1), 0.5))
+
+  def list_early(path: Any) -> list[str]:
+    monkeypatch.setattr(os, "listdir", listdir)
+    names = listdir(path)
+    _save(tmp_path, (2, _state(2), 0.5), keep=1)
+    return names
+
+  monkeypatch.setattr(os, "listdir", list_early)
+  found = checkpoint_reader.restore(tmp_path, None, {"state": _state()})
+  assert found.step == 2
 
 
 def test_records_are_read_again_if_a_run_replaces_its_checkpoint(

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import io
 import json
 import os
 from pathlib import Path
-import pty
 import struct
 import sys
 import time
@@ -21,6 +19,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from tensorboardX.proto import event_pb2
+from terminals import read_all, terminal
 
 from apnpql_jax.config import codec
 from apnpql_jax.config.schema import TrainConfig
@@ -352,23 +351,18 @@ def test_speeds_of_a_resumed_run_leave_out_what_came_before():
 
 
 def test_progress_draws_a_bar_on_a_terminal():
-  controller, terminal = pty.openpty()
+  controller, end = terminal(80)
   clock = Clock()
-  with os.fdopen(terminal, "w", encoding="utf-8") as stream:
+  with os.fdopen(end, "w", encoding="utf-8") as stream:
     with TrainProgress(1000, stream=stream, clock=clock) as progress:
       progress.update(100, updates=20)
       clock.now += 10.0
       progress.update(500, updates=100, success_rate=0.5)
       progress.message("a [bracketed] note")
-  shown = b""
-  with contextlib.suppress(OSError):  # Raised at the end, for the terminal is closed.
-    while part := os.read(controller, 2**16):
-      shown += part
-  os.close(controller)
-  shown = shown.decode()
-  assert "50%" in shown and "success 50 %  40 steps/s  8.0 updates/s" in shown
-  assert "0:00:13" in shown  # Left: 500 steps at 40 a second.
-  assert "a [bracketed] note" in shown and "\x1b[" in shown
+  text = read_all(controller)
+  assert "50%" in text and "success 50 %  40 steps/s  8.0 updates/s" in text
+  assert "0:00:13" in text  # Left: 500 steps at 40 a second.
+  assert "a [bracketed] note" in text and "\x1b[" in text
 
 
 def test_progress_writes_to_standard_error_only(capsys):

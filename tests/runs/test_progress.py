@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import fcntl
 import io
 import os
-import pty
 import re
-import struct
 import subprocess
 import sys
-import termios
 
 import pytest
+from terminals import read_all, terminal
 
 from apnpql_jax.runs.progress import TrainProgress
 from apnpql_jax.testing import ROOT
@@ -78,12 +75,6 @@ with TrainProgress(20480, eval_every=5120, clock=lambda: now) as progress:
 """
 
 
-def terminal(columns: int) -> tuple[int, int]:
-  controller, end = pty.openpty()
-  fcntl.ioctl(end, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
-  return controller, end
-
-
 def environment() -> dict[str, str]:
   env = os.environ | {"PYTHONPATH": str(ROOT), "TERM": "xterm-256color"}
   return {name: value for name, value in env.items() if name != "COLUMNS"}
@@ -94,9 +85,8 @@ def test_success_and_time_left_fit_the_terminal(columns):
   controller, end = terminal(columns)
   subprocess.run([sys.executable, "-c", SHOWN], stderr=end, env=environment())
   os.close(end)
-  text = os.read(controller, 1 << 16).decode()
-  os.close(controller)
-  lines = re.split(r"[\r\n]+", re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text))
+  text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", read_all(controller))
+  lines = re.split(r"[\r\n]+", text)
   last = [line for line in lines if line][-1]
   assert " 50% success 100 %" in last and last.endswith(">0:00:51 left")
   assert len(last) <= columns and ("10,240 steps" in last) == (columns == 100)

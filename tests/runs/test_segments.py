@@ -104,7 +104,7 @@ def restored(run: Path, step: int | None = None) -> tuple[int, dict[str, int]]:
 
 
 def on_disk(run: Path) -> set[str]:
-  return {path.name for path in (run / "segments").iterdir()}
+  return {path.name for path in (run / "segments").glob("*")}
 
 
 def in_use(run: Path) -> set[str]:

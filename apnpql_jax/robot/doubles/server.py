@@ -203,6 +203,7 @@ class Remote:
     """Returns the true state of the plant."""
     plant, data = self._plant, self._plant.data
     return {
+      "time": data.time,
       "position": plant.position.tolist(),
       "target": plant.target.tolist(),
       "finger": plant.finger,

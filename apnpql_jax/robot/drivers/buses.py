@@ -9,6 +9,10 @@ At 57,600 baud, a reading of four bytes takes 5.5 ms on the line: 29 bytes, and 
 0.5 ms before the gripper answers. A USB adapter by FTDI hands bytes over every 16 ms
 unless its latency timer is set lower. So an answer arrives within 22 ms. Both buses
 wait about 37 ms for it and try three times: a silent line is an error within 0.12 s.
+
+Answers do not name their requests. So the late answer to a first attempt passes for
+that to the second one, whose own is still to come. Both buses wait for it and discard
+it, lest the next request, of another address, gets it.
 """
 
 from __future__ import annotations
@@ -17,6 +21,7 @@ from collections.abc import Callable
 import contextlib
 import importlib
 import os
+import time
 from typing import Any, Protocol
 
 from apnpql_jax.errors import DeviceError, one_line
@@ -94,7 +99,7 @@ class Dynamixel:
     It tries again where either packet has been damaged on its way. If that is the
     instruction, the gripper reports it in an answer without data, which is whole.
     """
-    for _ in range(ATTEMPTS):
+    for attempt in range(ATTEMPTS):
       try:
         *found, result, error = call(self._port, self._id, address, *args)
       except Exception as failure:  # Those of pyserial, and of termios.
@@ -105,6 +110,7 @@ class Dynamixel:
       if error:
         reason = one_line(Exception(self._packets.getRxPacketError(error)))
         raise DeviceError(f"{self._where}: it refuses to {verb} {address}: {reason}")
+      _await_late_answers(attempt)
       return found
     raise Silent(f"{self._where}: {_SILENT}")
 
@@ -150,15 +156,22 @@ class Modbus:
     self._client.close()
 
   def _try(self, call: Callable[..., Any], first: int, *args: Any, **named: Any) -> Any:
-    for _ in range(ATTEMPTS):
+    for attempt in range(ATTEMPTS):
       with contextlib.suppress(self._failure):
         answer = call(first, *args, device_id=self._id, **named)
         if answer.isError():
           raise DeviceError(
             f"{self._where}: it refuses register {first}: {one_line(Exception(answer))}"
           )
+        _await_late_answers(attempt)
         return answer
     raise Silent(f"{self._where}: {_SILENT}")
+
+
+def _await_late_answers(attempt: int) -> None:
+  """Waits after a repeated attempt; the next request discards what has arrived."""
+  if attempt > 0:
+    time.sleep(_ANSWER_S)
 
 
 def _cause(error: Exception) -> str:

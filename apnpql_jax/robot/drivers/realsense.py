@@ -240,4 +240,5 @@ class RealSense:
           break
       else:
         return time.monotonic()
-    return min(since_epoch / 1000 - time.time() + time.monotonic(), time.monotonic())
+    now = time.monotonic()  # First: a pause before the next clock makes a frame older.
+    return min(since_epoch / 1000 - time.time() + now, now)
