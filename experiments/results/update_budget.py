@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import dataclasses
-from statistics import median
 from typing import NamedTuple
 
 from comparison import Found, Result, Row, as_run
@@ -82,13 +81,14 @@ class Time(NamedTuple):
 
 
 def time_of(result: Result) -> Time:
-  """Returns the minutes of a run to the goal at its median speed.
+  """Returns the minutes of a run to the goal at the upper quartile of its speeds.
 
-  Evaluations take no part, nor does other work on the machine that disturbs less than
-  half of the run.
+  Evaluations take no part, nor does other work on the machine that slows less than
+  three quarters of the run.
   """
   run = as_run(result)
-  speed = median(row["time/updates_per_s"] or 0.0 for row in run.evaluations)
+  speeds = [row["time/updates_per_s"] or 0.0 for row in run.evaluations]
+  speed = float(np.quantile(speeds, 0.75))
   steps = first_at(run, GOAL, "steps")
   share = (steps or run.steps[-1]) / run.config.total_steps
   updates = share * UPDATES[run.config.env.task]
