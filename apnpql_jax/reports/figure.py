@@ -59,16 +59,20 @@ def save(
     for line in panel.get_lines()
     if not str(line.get_label()).startswith("_")
   }
-  figure.legend(
+  legend = figure.legend(
     handles.values(),
     handles.keys(),
     loc="outside lower center",
-    ncols=max(1, min(len(handles), columns + 1)),
     fontsize=8,
     frameon=False,
     title=caption(groups, band),
     title_fontsize=7,
   )
+  for ncols in range(max(1, min(len(handles), columns + 1)), 0, -1):
+    legend.set_ncols(ncols)
+    figure.draw_without_rendering()
+    if legend.get_window_extent().width <= figure.bbox.width:
+      break
   with replacing(path) as part:
     figure.savefig(part, dpi=140)
 

@@ -65,6 +65,7 @@ COMPARISON = dataclasses.replace(
     {row: Row("ap_npql") for row in ROWS},
     tasks=tuple(UPDATES),
     seeds=(0, 1),
+    axes=("steps",),
   ),
   options=options,
 )

@@ -27,7 +27,9 @@ RUNS = [
 ]
 
 by_folder = pytest.mark.parametrize(
-  "comparison", [*COMPARISONS, search.COMPARISON], ids=lambda x: x.out.name
+  "comparison",
+  [*COMPARISONS, search.COMPARISON, update_budget.COMPARISON],
+  ids=lambda x: x.out.name,
 )
 
 
@@ -140,6 +142,12 @@ def test_the_stored_results_are_read_and_give_the_stored_table(comparison: Compa
   assert {task for task, _ in found} <= {*TASKS}
   assert sum(map(len, found.values())) == len([*comparison.out.glob("*.json")]) > 0
   assert comparison.table(found) == (comparison.out / "table.md").read_text()
+
+
+def test_the_stored_budgets_give_the_stored_effects():
+  comparison = update_budget.COMPARISON
+  text = update_budget.effects(comparison.tasks, comparison.results())
+  assert text == (comparison.out / "effects.md").read_text()
 
 
 def test_no_result_from_states_is_missing():

@@ -223,6 +223,20 @@ def test_a_figure_has_a_panel_for_each_task_and_axis(sweep, suffix):
     assert len(re.findall(r'id="axes_\d+"', text)) == 4
 
 
+def test_a_legend_of_long_titles_is_inside(sweep, tmp_path, monkeypatch):
+  made, new = [], figure._figure
+  monkeypatch.setattr(
+    figure, "_figure", lambda *size: made.append(new(*size)) or made[0]
+  )
+  found = groups.group(reading.find([sweep]))
+  figure.save(
+    [x._replace(label=14 * "long " + x.label) for x in found], tmp_path / "x.png"
+  )
+  (legend,) = made[0].legends
+  inside = legend.get_window_extent()
+  assert inside.x0 >= 0 and inside.x1 <= made[0].bbox.width
+
+
 def test_a_title_has_one_color_in_all_panels(sweep):
   found = groups.group(reading.find([sweep]))
   colors = figure.colors_of(found)
