@@ -59,20 +59,21 @@ def save(
     for line in panel.get_lines()
     if not str(line.get_label()).startswith("_")
   }
-  legend = figure.legend(
-    handles.values(),
-    handles.keys(),
-    loc="outside lower center",
-    fontsize=8,
-    frameon=False,
-    title=caption(groups, band),
-    title_fontsize=7,
-  )
   for ncols in range(max(1, min(len(handles), columns + 1)), 0, -1):
-    legend.set_ncols(ncols)
+    legend = figure.legend(
+      handles.values(),
+      handles.keys(),
+      loc="outside lower center",
+      ncols=ncols,
+      fontsize=8,
+      frameon=False,
+      title=caption(groups, band),
+      title_fontsize=7,
+    )
     figure.draw_without_rendering()
-    if legend.get_window_extent().width <= figure.bbox.width:
+    if ncols == 1 or legend.get_window_extent().width <= figure.bbox.width:
       break
+    legend.remove()
   with replacing(path) as part:
     figure.savefig(part, dpi=140)
 
