@@ -28,9 +28,9 @@ def on_terminal(*args: str, columns: int, **env: str) -> str:
     env={k: x for k, x in (ENV | env).items() if k != "COLUMNS"},
   )
   os.close(end)
-  text = read_all(controller)
+  shown = read_all(controller)
   assert process.wait() == 0
-  return text
+  return shown
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -90,7 +90,7 @@ def test_a_failed_run_costs_the_others_nothing_and_is_retried(tmp_path):
 
 
 def test_what_another_process_has_saved_meanwhile_is_kept(tmp_path):
-  """A job that it left on a cluster is taken over rather than started again."""
+  """Its job has ended, and its attempts count."""
   program = f"open({str(tmp_path / 'started')!r}, 'x')"
   sweep = sweep_of(tmp_path, program)
   meanwhile = sweep_of(tmp_path, program)
