@@ -12,6 +12,7 @@ import textwrap
 import threading
 import time
 
+from hypothesis import given, strategies as st
 import pytest
 from rich.console import Console
 from run_files import make_run
@@ -130,14 +131,34 @@ def test_runs_at_the_same_time_have_cores_of_their_own(tmp_path, monkeypatch):
     (1, [[0, 1, 2, 3, 4]]),
     (2, [[0, 1], [2, 3, 4]]),
     (5, [[0], [1], [2], [3], [4]]),
-    (7, [[0], [0], [1], [2], [3], [4], [4]]),
+    (7, [[0], [0], [1], [2], [2], [3], [4]]),
   ],
 )
 def test_shares_are_neighbors_and_none_is_empty(count, expected):
-  found = shares(range(5), count)
+  assert shares(range(5), count) == expected
+
+
+@given(size=st.integers(1, 16), count=st.integers(1, 40))
+def test_all_items_are_shared_and_as_evenly_as_possible(size, count):
+  found = shares(range(size), count)
   assert all(found) and len(found) == count
-  if count <= 5:
-    assert found == expected
+  used = [sum(item in share for share in found) for item in range(size)]
+  assert min(used) >= max(1, count // size) and max(used) <= -(-count // size)
+
+
+def test_runs_that_share_a_gpu_do_not_reserve_more_than_its_memory(
+  tmp_path, monkeypatch
+):
+  monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
+  program = """
+    import os, time
+    time.sleep(1)
+    names = "CUDA_VISIBLE_DEVICES", "XLA_PYTHON_CLIENT_MEM_FRACTION"
+    print(*map(os.environ.get, names))
+  """
+  run(sweep_of(tmp_path, *4 * [program]), jobs=4)
+  found = [last_line(tmp_path / f"{name}.log").split() for name in "abcd"]
+  assert found == [["0", "0.450"], ["0", "0.450"], ["1", "0.450"], ["1", "0.450"]]
 
 
 WAITING = """
