@@ -63,7 +63,9 @@ class Runner:
 
   def _start(self) -> None:
     """Starts waiting runs while there is room."""
-    for entry in self._waiting()[: self._launcher.jobs - len(self._active)]:
+    # More may be in progress: an earlier process may have had room for them.
+    room = max(0, self._launcher.jobs - len(self._active))
+    for entry in self._waiting()[:room]:
       entry.attempts += 1
       entry.code, entry.line = None, ""
       try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 import errno
 import io
 import os
@@ -22,7 +23,7 @@ from apnpql_jax.runs import run_folder
 from apnpql_jax.sweeps import manifest as states
 from apnpql_jax.sweeps.display import SweepDisplay
 from apnpql_jax.sweeps.following import Follower, last_line
-from apnpql_jax.sweeps.launcher import Work
+from apnpql_jax.sweeps.launcher import Job, Launcher, Work
 from apnpql_jax.sweeps.local import LocalLauncher, available_cores, shares
 from apnpql_jax.sweeps.manifest import Entry, Manifest
 from apnpql_jax.sweeps.runner import Runner
@@ -231,6 +232,39 @@ def test_a_signal_reaches_jobs_too(tmp_path, monkeypatch):
 
   Runner(sweep, launcher, lambda _: None).run(caught, show)
   assert [(x.state, x.code, x.line) for x in sweep.runs] == [("stopped", 143, "saved")]
+
+
+class Finding(Launcher):
+  """A launcher that finds the processes of an earlier one, as on a cluster."""
+
+  def __init__(self, jobs: int, found: Mapping[str, Job]):
+    """Finds the jobs of ``found`` by their names."""
+    self.jobs, self._found = jobs, found
+    self._local = LocalLauncher(jobs)
+
+  def start(self, work: Work) -> Job:
+    """See ``Launcher.start``."""
+    return self._local.start(work)
+
+  def find(self, name: str) -> Job | None:
+    """See ``Launcher.find``."""
+    return self._found.get(name)
+
+
+def test_jobs_of_an_earlier_process_are_taken_over_and_take_their_room(tmp_path):
+  sweep = sweep_of(tmp_path, *2 * ["import time; time.sleep(1)"], "", "")
+  earlier, events = LocalLauncher(2), []
+  for entry in sweep.runs[:2]:
+    entry.attempts, entry.job = 1, f"job of {entry.name}"
+  found = {x.job: earlier.start(sweep.work(x)) for x in sweep.runs[:2]}
+  sweep.save()
+  runner = Runner(sweep, Finding(1, found), lambda x: events.append((x.name, x.state)))
+  runner.run([], lambda: None)
+  assert events[:2] == [("a", states.RUNNING), ("b", states.RUNNING)]
+  assert sorted(events[2:4]) == [("a", states.DONE), ("b", states.DONE)]
+  each = [(name, state) for name in "cd" for state in (states.RUNNING, states.DONE)]
+  assert events[4:] == each
+  assert [(x.attempts, x.job) for x in states.load(tmp_path).runs] == 4 * [(1, "")]
 
 
 def test_two_processes_cannot_run_one_sweep(tmp_path):
