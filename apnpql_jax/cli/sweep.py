@@ -107,10 +107,18 @@ def config_of(argv: Sequence[str]) -> TrainConfig:
   Raises:
     ConfigError: A setting is unknown or invalid.
   """
+  return _options_of(argv).config
+
+
+def _options_of(argv: Sequence[str]) -> Train:
+  """Returns what ``config_of`` does, as the same options if runs are the same."""
   base = Train(config=files.load_preset(argv[0]))
-  config = commands.with_shortcuts(parse(Train, "train", argv, default=base))
+  args = parse(Train, "train", argv, default=base)
+  config = commands.with_shortcuts(args)
   validate(config)
-  return config
+  return dataclasses.replace(
+    args, preset="", backend=None, obs=None, algorithm=None, config=config
+  )
 
 
 def _open(args: Sweep, stack: contextlib.ExitStack) -> Manifest:
@@ -123,8 +131,7 @@ def _open(args: Sweep, stack: contextlib.ExitStack) -> Manifest:
     names = ", ".join(files.preset_names())
     raise ConfigError(f"sweep needs a preset; choose from {names}")
   plan = make_plan(args.presets, args.grid, seeds=args.seeds, options=args.train)
-  for run in plan:
-    _check(run)
+  check_plan(plan)
   folder = args.out or states.find_equal(_ROOT, plan)
   if folder is None:
     stems = (Path(preset).stem for preset in args.presets)
@@ -153,15 +160,30 @@ def check_begun(manifest: Manifest) -> None:
       )
 
 
-def _check(run: Planned) -> None:
-  """Raises ``ConfigError`` that names a run whose options cannot be meant."""
+def check_plan(plan: Sequence[Planned]) -> None:
+  """Checks the options of all runs of a plan.
+
+  Raises:
+    ConfigError: Those of a run cannot be meant, or two runs are the same.
+  """
+  names: dict[Train, str] = {}
+  for run in plan:
+    name = names.setdefault(_checked(run), run.name)
+    if name != run.name:
+      raise ConfigError(f"{name} and {run.name} are the same run; leave one out")
+
+
+def _checked(run: Planned) -> Train:
+  """Returns the options of a run; raises ``ConfigError`` that names it."""
   fixed = {"--run", "--resume", "--overwrite", "--json", "--coordinator"}
   if found := fixed & {word.partition("=")[0] for word in run.argv}:
     raise ConfigError(f"leave out {', '.join(sorted(found))}; the sweep sets it itself")
   try:
-    check_sinks(config_of(run.argv).sinks)
+    options = _options_of(run.argv)
+    check_sinks(options.config.sinks)
   except UserError as error:
     raise ConfigError(f"{run.name}: {error}") from None
+  return options
 
 
 def _launcher(args: Sweep, manifest: Manifest) -> Any:

@@ -12,6 +12,9 @@ from apnpql_jax.config import codec, user_files
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import ConfigError
 
+_SHORT = {"algorithm": "agent.algorithm", "backend": "env.backend", "obs": "env.obs"}
+"""Options of ``apnpql train`` that are short for a setting."""
+
 
 class Planned(NamedTuple):
   """A run to train."""
@@ -47,8 +50,8 @@ def make_plan(
     ConfigError: An axis cannot be read, or two runs would be the same.
   """
   axes = [parse_axis(text) for text in grid]
-  names = [axis.option for axis in axes]
-  given = {_name(word) for word in options if word.startswith("--")}
+  names = [_setting(axis.option) for axis in axes]
+  given = {_setting(_name(word)) for word in options if word.startswith("--")}
   if twice := sorted(given & {"seed", *names}):
     raise ConfigError(f"give {', '.join(twice)} by --grid {twice[0]}=... alone")
   if repeated := sorted({name for name in names if names.count(name) > 1}):
@@ -92,6 +95,17 @@ def _name(option: str) -> str:
   return option.partition("=")[0].strip().lstrip("-").replace("-", "_")
 
 
+def _setting(option: str) -> str:
+  """Returns the setting of an option, also of one that is short or turns it off."""
+  group, dot, last = option.rpartition(".")
+  flag = f"{group}{dot}{last.removeprefix('no_')}"
+  return flag if _is_flag(flag) else _SHORT.get(option, option)
+
+
+def _is_flag(setting: str) -> bool:
+  return isinstance(dict(codec.flatten(TrainConfig())).get(setting), bool)
+
+
 def _run(
   preset: str, chosen: Sequence[tuple[Axis, str]], options: Sequence[str]
 ) -> Planned:
@@ -108,9 +122,8 @@ def _run(
 
 def _option(name: str, value: str) -> list[str]:
   """Returns a setting as options of the command line."""
-  settings = dict(codec.flatten(TrainConfig()))
   dashed = name.replace("_", "-")
-  if isinstance(settings.get(name), bool):
+  if _is_flag(name):
     if value.lower() not in ("true", "false"):
       raise ConfigError(f"--grid {name}={value}: {value!r} is neither true nor false")
     group, dot, last = dashed.rpartition(".")

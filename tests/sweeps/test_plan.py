@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from run_files import make_run
 
-from apnpql_jax.cli.sweep import check_begun, config_of, parse_sweep
+from apnpql_jax.cli.sweep import check_begun, check_plan, config_of, parse_sweep
 from apnpql_jax.errors import ConfigError, FileError
 from apnpql_jax.runs import run_folder
 from apnpql_jax.sweeps import manifest as states
@@ -58,6 +58,33 @@ def test_seeds_can_be_chosen_and_presets_are_an_axis():
 def test_a_plan_that_cannot_be_meant_is_refused(grid, seeds, words):
   with pytest.raises(ConfigError, match=words):
     make_plan(["push_plate"], grid, seeds=seeds)
+
+
+@pytest.mark.parametrize(
+  ("grid", "options", "words"),
+  [
+    ("agent.epsilon=1,2", "--agent.epsilon 3", "give agent.epsilon by --grid"),
+    ("agent.algorithm=sac,ap_sac", "--algorithm ap_npql", "give agent.algorithm by"),
+    ("algorithm=sac,ap_sac", "--agent.algorithm ap_npql", "give agent.algorithm by"),
+    ("env.obs=state,pixels", "--obs=state", "give env.obs by"),
+    ("env.backend=mjx,native", "--backend native", "give env.backend by"),
+    ("env.randomize=true", "--env.no-randomize", "give env.randomize by"),
+    ("video=true,false", "--no_video", "give video by"),
+    ("agent.n-step=1,2", "--agent.n_step 3", "give agent.n_step by"),
+    ("seed=1,2", "--seed 3", "give seed by"),
+  ],
+)
+def test_what_varies_is_not_given_for_all_runs_too(grid, options, words):
+  with pytest.raises(ConfigError, match=words):
+    make_plan(["push_plate"], [grid], options=options.split())
+  with pytest.raises(ConfigError, match=f"{words.split()[1]} twice"):
+    make_plan(["push_plate"], [grid, f"{words.split()[1]}=1"])
+
+
+def test_two_runs_that_are_the_same_are_refused():
+  with pytest.raises(ConfigError, match=r"epsilon_1-.* and .*_1\.0-.* are the same"):
+    check_plan(make_plan(["push_plate"], ["agent.epsilon=1,1.0"]))
+  check_plan(make_plan(["push_plate"], ["init_from=runs/a,runs/b"]))
 
 
 def test_options_that_the_sweep_does_not_have_are_those_of_train():
