@@ -12,7 +12,7 @@ import tyro
 
 from apnpql_jax.cli import commands
 from apnpql_jax.cli.options import Command, Count, File, Train, parse
-from apnpql_jax.config import files
+from apnpql_jax.config import files, user_files
 from apnpql_jax.config.checks import validate
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import ConfigError, UserError
@@ -112,7 +112,8 @@ def config_of(argv: Sequence[str]) -> TrainConfig:
 
 def _options_of(argv: Sequence[str]) -> Train:
   """Returns what ``config_of`` does, as the same options if runs are the same."""
-  base = Train(config=files.load_preset(argv[0]))
+  named = Train(preset=argv[0], task_file=user_files.task_file(argv))
+  base = Train(config=commands.base_config(named))
   args = parse(Train, "train", argv, default=base)
   config = commands.with_shortcuts(args)
   validate(config)

@@ -363,3 +363,5 @@ def test_a_run_that_has_begun_is_resumed_with_what_it_does_not_store(
   assert work.command()[3:] == [*resumed, "--devices", "4"]
   named = work._replace(argv=["push_plate"])
   assert named.command()[3:] == resumed[:3]
+  both = work._replace(argv=["./mine.py", "--task-file", "task.py"])
+  assert both.command()[3:] == [*resumed[:4], "task.py"]
