@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import itertools
+import os
 from pathlib import Path
 import re
 from typing import NamedTuple
@@ -14,6 +15,9 @@ from apnpql_jax.errors import ConfigError
 
 _SHORT = {"algorithm": "agent.algorithm", "backend": "env.backend", "obs": "env.obs"}
 """Options of ``apnpql train`` that are short for a setting."""
+
+_PATHS = {"init_from", "replay.demonstrations", "task_file"}
+"""Options of ``apnpql train`` that name a file or folder."""
 
 
 class Planned(NamedTuple):
@@ -110,9 +114,8 @@ def _run(
   preset: str, chosen: Sequence[tuple[Axis, str]], options: Sequence[str]
 ) -> Planned:
   name = [_plain(Path(preset).stem)]
-  # A sweep may be continued from another folder.
   path = str(Path(preset).resolve()) if user_files.is_file(preset) else preset
-  argv = [path, *options]
+  argv = [path, *_with_absolute_paths(options)]
   for axis, value in chosen:
     short = axis.option.rpartition(".")[2]
     name.append(_plain(f"{short}_{value}"))
@@ -123,12 +126,33 @@ def _run(
 def _option(name: str, value: str) -> list[str]:
   """Returns a setting as options of the command line."""
   dashed = name.replace("_", "-")
+  if name in _PATHS:
+    return [f"--{dashed}", _absolute(value)]
   if _is_flag(name):
     if value.lower() not in ("true", "false"):
       raise ConfigError(f"--grid {name}={value}: {value!r} is neither true nor false")
     group, dot, last = dashed.rpartition(".")
     return [f"--{dashed}" if value.lower() == "true" else f"--{group}{dot}no-{last}"]
   return [f"--{dashed}", *value.split()]
+
+
+def _with_absolute_paths(options: Sequence[str]) -> list[str]:
+  """Returns options with absolute paths: a sweep may be continued from elsewhere."""
+  found, name = [], ""
+  for word in options:
+    option, equals, value = word.partition("=")
+    if word.startswith("--"):
+      name = _name(option)
+      word = f"{option}={_absolute(value)}" if equals and name in _PATHS else word
+    elif name in _PATHS:
+      word = _absolute(word)
+    found.append(word)
+  return found
+
+
+def _absolute(path: str) -> str:
+  """Returns an absolute path; ``RUN:STEP`` keeps its step, and "" means no file."""
+  return os.path.abspath(path) if path else ""
 
 
 def _plain(text: str) -> str:

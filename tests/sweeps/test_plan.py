@@ -87,6 +87,24 @@ def test_two_runs_that_are_the_same_are_refused():
   check_plan(make_plan(["push_plate"], ["init_from=runs/a,runs/b"]))
 
 
+def test_a_sweep_finds_its_files_from_another_folder(tmp_path, monkeypatch):
+  monkeypatch.chdir(tmp_path)
+  (tmp_path / "task.py").touch()
+  grid = ["replay.demonstrations=mine.npz,my demos.npz"]
+  line = "--init-from runs/a:20 --task_file=./task.py --env.obs=state"
+  plan = make_plan(["push_plate"], grid, options=line.split())
+  elsewhere = make_plan(["push_plate"], ["init_from=runs/b:best"])
+  monkeypatch.chdir("/")
+  check_plan(plan)
+  found = [config_of(run.argv).replay.demonstrations for run in plan]
+  assert found == [str(tmp_path / name) for name in ("mine.npz", "my demos.npz")]
+  start = ["--init-from", f"{tmp_path}/runs/a:20", f"--task_file={tmp_path}/task.py"]
+  assert all(run.argv[1:4] == start for run in plan)
+  assert elsewhere[0].argv[1:3] == ["--init-from", f"{tmp_path}/runs/b:best"]
+  (none,) = make_plan(["push_plate"], [], options=["--replay.demonstrations", ""])
+  assert config_of(none.argv).replay.demonstrations == ""
+
+
 def test_options_that_the_sweep_does_not_have_are_those_of_train():
   line = (
     "push_plate --obs state --grid agent.n-step=2,3 --agent.hidden 16 16 --seeds 2 "
