@@ -156,8 +156,9 @@ def check_begun(manifest: Manifest) -> None:
     began = run_folder.load_run_config(run_dir)
     if diff := differences(began, config_of(entry.argv)):
       raise ConfigError(
-        f"{run_dir} began with other settings: {files.format_diff(diff)}; remove it to "
-        "train it again, or choose another --out"
+        f"{run_dir} began with other settings: {files.format_diff(diff)}; continue "
+        f"with those: apnpql sweep --resume {manifest.folder}; or choose another "
+        "--out, or remove the run to train it again"
       )
 
 

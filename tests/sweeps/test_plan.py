@@ -184,7 +184,8 @@ def test_a_preset_that_has_changed_is_noticed(tmp_path):
   run_folder.create(tmp_path / "run", config_of(begun.runs[0].argv))
   check_begun(begun)
   check_begun(planned("b.py", "total_steps=1000, checkpoint_every=7"))
-  with pytest.raises(ConfigError, match=r"total_steps.*remove it to train it again"):
+  cures = f"total_steps.* sweep --resume {tmp_path}; or .*--out, or remove the run"
+  with pytest.raises(ConfigError, match=cures):
     check_begun(planned("c.py", "total_steps=2000"))
 
 
