@@ -90,9 +90,9 @@ def train(
     init_from: ``RUN``, ``RUN:STEP`` or ``RUN:best``: another run with whose weights
       this one starts. Optimizers and replay start empty.
     mesh: Devices to train on; the default device if None.
-    handle_signals: Save and stop at SIGINT or SIGTERM. The process ends at once if
-      there is nothing to save yet, and at a second signal. Python allows this in the
-      main thread only. By default, Ctrl-C raises ``KeyboardInterrupt`` as usual.
+    handle_signals: Save and stop at SIGINT, SIGTERM or SIGHUP. The process ends at
+      once if there is nothing to save yet, and at a second signal. Python allows this
+      in the main thread only. By default, Ctrl-C raises ``KeyboardInterrupt`` as usual.
 
   Returns:
     The run folder, steps, updates and the last evaluation.
