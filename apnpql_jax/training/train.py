@@ -312,9 +312,10 @@ def _loop(config, start, iteration, reporter, saver, signals) -> TrainState:
     skipped_updates.check(config, state, start.path)
     done = step >= config.total_steps
     rate = None
-    # Check for signals first, so that saving does not wait for an evaluation.
+    # Check for signals first, so that saving does not wait for an evaluation, unless no
+    # resume would make up for it.
     stop = devices.any_process(signals.caught)
-    if not stop and (done or _passed(before, step, config.eval_every)):
+    if done or not stop and _passed(before, step, config.eval_every):
       rate = reporter.evaluate(step, state, last=done) if reporter else None
       stop = devices.any_process(signals.caught)
     last = done or stop
