@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 import os
 from pathlib import Path
 import signal
@@ -45,6 +46,14 @@ with Signals("nothing is saved"), run_folder.new_run_dir("a", root) as run:
     print("ready", flush=True)
     time.sleep(60)
 """
+
+
+@pytest.fixture(autouse=True)
+def _hears_hangups() -> Generator[None]:
+  """Undoes a ``nohup`` of the tests, which their processes would inherit."""
+  before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+  yield
+  signal.signal(signal.SIGHUP, before)
 
 
 @pytest.mark.parametrize(("work", "left"), [("none", []), ("made", ["a-1"])])
