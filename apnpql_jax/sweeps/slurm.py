@@ -23,6 +23,9 @@ ALL_AT_ONCE = 1_000_000
 DEFAULTS = {"name": "apnpql", "timeout_min": 24 * 60}
 """Settings of the jobs unless the user gives others; submitit's limit is minutes."""
 
+_TIMEOUTS = 1_000_000
+"""How often a run may reach the end of its time; submitit's default is 3."""
+
 _LOST = 1  # exit code of a job that ended without one
 
 
@@ -131,7 +134,9 @@ class SlurmLauncher:
       )
     self.jobs, self._cluster = jobs, cluster
     try:
-      self._executor = submitit.AutoExecutor(folder, cluster=cluster)
+      self._executor = submitit.AutoExecutor(
+        folder, cluster=cluster, **{f"{cluster}_max_num_timeout": _TIMEOUTS}
+      )
       self._executor.update_parameters(**(DEFAULTS | dict(settings or {})))
     except (RuntimeError, ValueError, NameError, AssertionError) as error:
       raise ConfigError(f"--launcher slurm: {one_line(error)}") from None

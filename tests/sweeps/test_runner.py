@@ -189,31 +189,37 @@ def test_a_signal_reaches_the_runs_and_starts_no_more(tmp_path):
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="only on Linux")
 def test_a_job_whose_time_is_over_saves_and_is_queued_again(tmp_path, monkeypatch):
+  """More often than the three times that submitit allows by itself."""
   pytest.importorskip("submitit")
   monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
   program = f"""
     import pathlib, signal, sys, time
-    path = pathlib.Path({str(tmp_path / "saved")!r})
-    if path.exists():
+    path = pathlib.Path({str(tmp_path)!r}, "saved")
+    saves = int(path.read_text()) if path.exists() else 0
+    if saves == 4:
       sys.exit(print("resumed"))
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(path.touch() or 143))
+    more = str(saves + 1)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(path.write_text(more) and 143))
     print("ready", flush=True)
     time.sleep(600)
   """
   sweep = sweep_of(tmp_path, program)
-  launcher = SlurmLauncher(tmp_path / "submitit", cluster="local")
+  settings = {"timeout_min": 10}  # So few that each end counts at once.
+  folder = tmp_path / "submitit"
+  launcher = SlurmLauncher(folder, cluster="local", settings=settings)
   log = tmp_path / "a.log"
 
   def over() -> None:
-    while not (log.exists() and log.read_text()):
-      time.sleep(0.05)
-    job = sweep.runs[0].job
-    children = Path(f"/proc/{job}/task/{job}/children").read_text().split()
-    os.kill(int(children[0]), signal.SIGUSR2)  # As submitit does before the end.
+    for number in range(1, 5):
+      while not (log.exists() and log.read_text().count("ready") == number):
+        time.sleep(0.05)
+      job = sweep.runs[0].job
+      children = Path(f"/proc/{job}/task/{job}/children").read_text().split()
+      os.kill(int(children[0]), signal.SIGUSR2)  # As submitit does before the end.
 
   threading.Thread(target=over).start()
   Runner(sweep, launcher, lambda _: None).run([], lambda: None)
-  assert log.read_text() == "ready\nresumed\n"
+  assert log.read_text() == 4 * "ready\n" + "resumed\n"
   (entry,) = states.load(tmp_path).runs
   assert (entry.state, entry.attempts, entry.code) == (states.DONE, 1, 0)
 
