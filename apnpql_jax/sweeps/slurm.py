@@ -14,7 +14,7 @@ import signal
 import subprocess
 from typing import Any
 
-from apnpql_jax.errors import ConfigError, FileError, one_line
+from apnpql_jax.errors import INTERRUPTED, ConfigError, FileError, one_line
 from apnpql_jax.sweeps.launcher import Job, Work
 
 ALL_AT_ONCE = 1_000_000
@@ -74,7 +74,7 @@ class ClusterJob(Job):
   def __init__(self, job: Any, cluster: str):
     """Wraps a job of the cluster ``slurm``, or of ``local`` processes."""
     self.name, self._job, self._cluster = job.job_id, job, cluster
-    self.error = ""
+    self.error, self._stopped = "", False
 
   def poll(self) -> int | None:
     """See ``Job.poll``."""
@@ -84,15 +84,17 @@ class ClusterJob(Job):
       return int(self._job.result())
     except Exception as error:  # Whatever the cluster did to the job.
       self.error = f"job {self.name}: {one_line(error)}"
-      return _LOST
+      return INTERRUPTED + signal.SIGTERM if self._stopped else _LOST
 
   def stop(self) -> None:
     """See ``Job.stop``; a job that still waits leaves the queue.
 
     A plain ``scancel`` would kill the run half a minute later, while it still saves.
     """
+    self._stopped = True
     if self._cluster == "local":
-      os.kill(int(self.name), signal.SIGTERM)
+      with contextlib.suppress(ProcessLookupError):  # It has just ended.
+        os.kill(int(self.name), signal.SIGTERM)
     elif self._job.state == "PENDING":
       self._job.cancel()
     else:

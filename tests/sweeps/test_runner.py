@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 import errno
 import io
 import os
@@ -56,7 +56,11 @@ def sweep_of(folder: Path, *programs: str) -> Manifest:
 
 
 def run(
-  sweep: Manifest, *, jobs: int = 1, caught: list[int] | None = None
+  sweep: Manifest,
+  *,
+  jobs: int = 1,
+  caught: list[int] | None = None,
+  show: Callable[[], None] = lambda: None,
 ) -> list[str]:
   """Runs a sweep and returns the names of runs in the order in which they started."""
   started = []
@@ -66,7 +70,7 @@ def run(
       started.append(entry.name)
 
   caught = [] if caught is None else caught
-  Runner(sweep, LocalLauncher(jobs), report).run(caught, lambda: None)
+  Runner(sweep, LocalLauncher(jobs), report).run(caught, show)
   return started
 
 
@@ -271,6 +275,70 @@ def test_jobs_of_an_earlier_process_are_taken_over_and_take_their_room(tmp_path)
   each = [(name, state) for name in "cd" for state in (states.RUNNING, states.DONE)]
   assert events[4:] == each
   assert [(x.attempts, x.job) for x in states.load(tmp_path).runs] == 4 * [(1, "")]
+
+
+def test_a_closed_terminal_leaves_jobs_running(tmp_path, monkeypatch):
+  pytest.importorskip("submitit")
+  monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+  sweep = sweep_of(tmp_path, WAITING, "")
+  launcher = SlurmLauncher(tmp_path / "submitit", cluster="local", jobs=1)
+  caught: list[int] = []
+  log = tmp_path / "a.log"
+
+  def show() -> None:
+    if log.exists() and log.read_text():
+      caught.append(signal.SIGHUP)
+
+  Runner(sweep, launcher, lambda _: None).run(caught, show)
+  first, second = states.load(tmp_path).runs
+  assert (first.state, second.state) == (states.RUNNING, states.WAITING)
+  os.kill(int(first.job), signal.SIGTERM)  # It still runs.
+  while "saved" not in log.read_text():
+    time.sleep(0.05)
+
+
+def test_a_job_that_has_just_ended_can_be_stopped(tmp_path, monkeypatch):
+  pytest.importorskip("submitit")
+  monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+  sweep = sweep_of(tmp_path, "")
+  launcher = SlurmLauncher(tmp_path / "submitit", cluster="local")
+  job = launcher.start(sweep.work(sweep.runs[0]))
+  while (code := job.poll()) is None:
+    time.sleep(0.05)
+  job.stop()
+  assert code == 0
+
+
+SLURM = {
+  "srun": "",
+  "sbatch": 'echo "Submitted batch job 17"; echo PENDING > state',
+  "sacct": 'echo "JobID|State|NodeList"; echo "17|$(cat state)|"',
+  "scancel": 'echo "CANCELLED by 0" > state',  # codespell:ignore
+}
+"""Commands of a cluster whose queue does not move."""
+
+
+def test_a_job_that_is_canceled_in_the_queue_has_been_stopped(tmp_path, monkeypatch):
+  pytest.importorskip("submitit")
+  monkeypatch.chdir(tmp_path)
+  monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+  for name, lines in SLURM.items():
+    (tmp_path / name).write_text(f"#!/bin/sh\ncd {tmp_path}\n{lines}\n")
+    (tmp_path / name).chmod(0o755)
+  sweep = sweep_of(tmp_path, "")
+  Runner(sweep, SlurmLauncher(tmp_path / "submitit"), lambda _: None).run(
+    caught := [], lambda: caught.append(signal.SIGINT)
+  )
+  (entry,) = states.load(tmp_path).runs
+  assert (entry.state, entry.code) == (states.STOPPED, 143)
+  assert "job 17" in entry.line
+
+
+def test_a_run_that_is_stopped_as_it_starts_has_not_failed(tmp_path):
+  sweep = sweep_of(tmp_path, "import time; time.sleep(60)")
+  caught: list[int] = []
+  run(sweep, caught=caught, show=lambda: caught.append(signal.SIGINT))
+  assert (sweep.runs[0].state, sweep.runs[0].code) == (states.STOPPED, -signal.SIGTERM)
 
 
 def test_two_processes_cannot_run_one_sweep(tmp_path):
