@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import metadata
 import json
 import os
 from pathlib import Path
@@ -123,6 +124,27 @@ def test_lock_satisfies_the_requirements_of_the_project(lock, wanted):
     (version,) = (x.version for x in found.specifier)
     assert requirement.specifier.contains(version, prereleases=True), requirement
     assert found.marker == requirement.marker
+
+
+EXPORT = """
+import sys
+sys.modules.update(dict.fromkeys(sys.argv[1:]))  # As if they were not installed.
+import jax
+made = jax.export.export(jax.jit(lambda x: 2 * x))(1.0).serialize()
+print(jax.export.deserialize(made).call(3.0))
+"""
+
+
+def test_the_lock_of_the_runtime_suffices_for_exported_programs(tmp_path):
+  """``robot run`` plays them after ``make``, without an extra."""
+  runtime_has = locked("requirements.lock").keys()
+  others = [
+    module
+    for module, packages in metadata.packages_distributions().items()
+    if runtime_has.isdisjoint(map(canonicalize_name, packages))
+  ]
+  assert "pytest" in others
+  assert python(ROOT, tmp_path, "-c", EXPORT, *others) == "6.0\n"
 
 
 def test_the_workflow_caches_what_the_tests_compile():
