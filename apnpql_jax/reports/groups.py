@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 import re
 from typing import Any, NamedTuple
@@ -38,10 +39,18 @@ class Group(NamedTuple):
 
 
 def group(runs: Sequence[Run]) -> list[Group]:
-  """Returns the groups, by task and then in the order in which they are given."""
+  """Returns the groups, by task and then in the order in which they are given.
+
+  Runs that repeat the seed of another are no more evidence, so they make groups of
+  their own.
+  """
   tasks: dict[str, dict[tuple[Any, ...], list[Run]]] = {}
+  seen: Counter[tuple[Any, ...]] = Counter()
   for run in runs:
-    key = tuple(settings(run.config).values())
+    values = tuple(settings(run.config).values())
+    repeats = seen[run.config.seed, values]
+    seen[run.config.seed, values] += 1
+    key = repeats, values
     tasks.setdefault(run.config.env.task, {}).setdefault(key, []).append(run)
   found = []
   for task, groups in tasks.items():

@@ -109,6 +109,13 @@ def test_settings_that_do_not_affect_learning_make_no_group(tmp_path):
   assert [len(group.runs) for group in groups.group(reading.find([tmp_path]))] == [2]
 
 
+def test_a_repeated_seed_is_no_second_one(tmp_path):
+  for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+    make_run(tmp_path / name, [0.5], seed=seed)
+  found = groups.group(reading.find([tmp_path]))
+  assert [(group.label, len(group.runs)) for group in found] == [("a", 2), ("b", 1)]
+
+
 def test_steps_set_apart_runs_that_differ_in_nothing_else(tmp_path):
   make_run(tmp_path / "a", [0.5])
   make_run(tmp_path / "b", [0.5, 0.6])
