@@ -96,7 +96,7 @@ class ClusterJob(Job):
       with contextlib.suppress(ProcessLookupError):  # It has just ended.
         os.kill(int(self.name), signal.SIGTERM)
     elif self._job.state == "PENDING":
-      self._job.cancel()
+      self._job.cancel(check=False)
     else:
       subprocess.run(["scancel", "--signal=TERM", self.name], check=False)
 
