@@ -8,6 +8,7 @@ import json
 
 import ablations
 from comparison import PAPER, TASKS, Comparison
+import constraint
 import pixel_comparison
 import pytest
 import search
@@ -19,7 +20,7 @@ from apnpql_jax.config.checks import validate
 from apnpql_jax.config.files import config_diff
 
 COMPARISONS = [state_comparison.COMPARISON, pixel_comparison.COMPARISON]
-OTHERS = [search.COMPARISON, ablations.COMPARISON, update_budget.COMPARISON]
+OTHERS = [x.COMPARISON for x in (search, ablations, update_budget, constraint)]
 RUNS = [
   (comparison, task, row)
   for comparison in (*COMPARISONS, *OTHERS)
