@@ -291,7 +291,7 @@ def _expert(config: TrainConfig) -> ExpertReplayMaker:
   allow = config.replay.allow_unsolved
   demos = demonstrations.load(path, task, config.env, allow_unsolved=allow)
   slots = config.replay.expert_steps
-  _print_line(f"expert replay: {demos.instants} instants of {path} fill {slots} slots")
+  _print_line(f"expert replay: {slots} slots from {demos.instants} instants of {path}")
   return functools.partial(expert.replay_from_demonstrations, demos)
 
 
