@@ -59,7 +59,8 @@ class FunctionalEnv:
   """
 
   action_size = ACTION_DIM
-  """Joint velocities in [-1, 1] rad/s, and the gripper, which 1 closes."""
+  """Joint velocities in [-1, 1] rad/s, and the gripper, which closes where its command
+  is positive, as in Gymnasium: 0 and 1 work, and so do policies in [-1, 1]."""
 
   def __init__(self, config: EnvConfig):
     """Builds the environment; ``worlds`` of the settings has no effect.
@@ -84,6 +85,7 @@ class FunctionalEnv:
   def _step(self, state: State, action: Float[Array, "worlds 7"]) -> State:
     rows, keys, rng = self._draw(state.info["rng"])
     before = state.pipeline_state
+    action = action.at[:, -1].set(action[:, -1] > 0.0)
     arrival = self.env.advance_or_begin(before, action, rows, keys)
     worlds = truncate_faults(before, self.env.observe(arrival))
     after = _state(worlds, rng, before.faults)

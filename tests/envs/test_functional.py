@@ -54,6 +54,19 @@ def test_vmap_equals_one_world_after_the_other(env):
     np.testing.assert_array_equal(alone.done, many.done[world])
 
 
+def test_the_gripper_closes_where_its_command_is_positive(env):
+  """So that actions in [-1, 1], as those of Brax's policies, mean the same."""
+  commands = jnp.array([-1.0, 0.0, 0.3, 1.0])
+  state = jax.jit(jax.vmap(env.reset))(jnp.tile(jax.random.key(5), 4))
+  for _ in range(2):
+    actions = jnp.zeros((4, 7)).at[:, -1].set(commands)
+    state = jax.jit(jax.vmap(env.step))(state, actions)
+  joints = np.asarray(state.pipeline_state.physics.qpos)
+  np.testing.assert_allclose(joints[::2], joints[1::2], atol=1e-5)
+  finger = env.env.task.scene.gripper_qpos
+  assert abs(joints[2, finger] - joints[1, finger]) > 0.05
+
+
 def test_a_step_after_the_end_begins_a_random_episode(env):
   keys = jax.random.split(jax.random.key(2), WORLDS)
   still = jnp.zeros((WORLDS, PERIODS, 7))
