@@ -52,10 +52,14 @@ def _check_resets(task: Task) -> tuple[PhysicsState, Kinematics]:
   scene, model, n = task.scene, task.scene.model, _WORLDS
   rng = np.random.default_rng(0)
   draw = _call(task.name, "sample_resets", _method(task, "sample_resets"), rng, n)
+  if not isinstance(draw, ResetDraw):
+    returned = type(draw).__name__
+    raise ConfigError(
+      f"task {task.name!r}: sample_resets returns {returned}, not ResetDraw"
+    )
   mocap = _floats(n, model.nmocap, 3), _floats(n, model.nmocap, 4)
   variants = jax.ShapeDtypeStruct((n,), np.int32)
   _compare(task, "sample_resets", draw, (_floats(n, model.nq), *mocap, variants))
-  draw = ResetDraw(*draw)
   quats = [draw.qpos[:, i + 3 : i + 7] for i in model.jnt_qposadr[free_joints(model)]]
   quats += list(np.moveaxis(draw.mocap_quat, 1, 0))
   lengths = [np.linalg.norm(quat, axis=-1) for quat in quats]

@@ -71,6 +71,11 @@ WRONG: list[tuple[str, Any, str]] = [
     lambda s, *x: (*PushPlate.tool_targets(s, *x)[:2], jnp.ones((3, 5))),
     "float[3, 5]) .* float[5, 3])",
   ),
+  (
+    "sample_resets",
+    lambda s, *x: tuple(PushPlate.sample_resets(s, *x)),
+    "returns tuple, not ResetDraw",
+  ),
   ("sample_resets", _draw(qpos=lambda x: x[:, :10]), "(float[5, 10], .* (float[5, 17]"),
   ("sample_resets", _draw(variant=lambda x: x * 1.0), "float[5]) .* int[5])"),
   ("sample_resets", _draw(variant=lambda x: x + 1), "variant that is not from 0 to 0"),
