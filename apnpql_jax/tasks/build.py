@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import functools
+import inspect
 from typing import Any
 
 import jax
@@ -28,10 +29,13 @@ def make_task(name: str) -> Task:
   """Builds the task ``name`` and checks it.
 
   Raises:
-    ConfigError: No task has this name, two files want it, a free body of its scene
-      would fall out of the world, or a method does not follow the protocol.
+    ConfigError: No task has this name, two files want it, its class is not in a file, a
+      free body of its scene would fall out of the world, or a method does not follow
+      the protocol.
   """
-  task = _call(name, "__init__", task_class(name))
+  kind = task_class(name)
+  _check_file(name, kind)
+  task = _call(name, "__init__", kind)
   scene = getattr(task, "scene", None)
   if not isinstance(scene, Scene):
     raise ConfigError(f"task {name!r} has no Scene in its attribute scene")
@@ -45,6 +49,17 @@ def make_task(name: str) -> Task:
   _check(task, "expert", (state, kinematics, primitives), _floats(n, ACTION_DIM))
   _check(task, "objects", (state,), None)
   return task
+
+
+def _check_file(name: str, kind: type[Task]) -> None:
+  """Checks that a class is in a file, next to which its scene may be."""
+  try:
+    inspect.getfile(kind)
+  except (OSError, TypeError):
+    raise ConfigError(
+      f"the class of task {name!r} is not in a file, but in a notebook or at a prompt: "
+      "write it to a Python file and load that, as load_preset does with its path"
+    ) from None
 
 
 def _check_resets(task: Task) -> tuple[PhysicsState, Kinematics]:
