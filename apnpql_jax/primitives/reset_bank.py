@@ -253,10 +253,14 @@ def _file_name(task: Task, rows: int, seed: int) -> str:
 
 
 def _source(task: Task) -> str:
-  """Returns a hash of the files of the task's classes and of those shared by tasks."""
+  """Returns a hash of the files of the task's classes and of those shared by tasks.
+
+  A file of the user's counts with those next to it, from which it may import ranges.
+  """
+  package = pathlib.Path(tasks.__file__).parent
   shared = [
     path
-    for path in sorted(pathlib.Path(tasks.__file__).parent.glob("*.py"))
+    for path in sorted(package.glob("*.py"))
     if "\n@register_task\n" not in path.read_text(encoding="utf-8")
   ]
   own = [
@@ -264,6 +268,10 @@ def _source(task: Task) -> str:
     for one in type(task).__mro__
     if one.__module__ not in sys.stdlib_module_names
   ]
-  files = dict.fromkeys([path for path in own if path not in shared] + shared)
+  folders = {path.parent: None for path in own if package not in path.parents}
+  near = [path for folder in folders for path in sorted(folder.glob("*.py"))]
+  near = filter(pathlib.Path.is_file, near)  # An editor's lock is a dangling link.
+  own = [path for path in own if path not in shared]
+  files = dict.fromkeys([*own, *near, *shared])
   contents = (path.read_bytes() for path in files)
   return hashlib.sha256(b"".join(contents)).hexdigest()

@@ -145,6 +145,22 @@ def test_a_base_class_in_another_file_is_part_of_the_banks_name(tmp_path, monkey
   assert name != reset_bank._file_name(mine, 16, 0)
 
 
+def test_a_file_next_to_the_users_is_part_of_the_banks_name(tmp_path, monkeypatch):
+  monkeypatch.syspath_prepend(tmp_path)
+  ranges = tmp_path / "ranges.py"
+  ranges.write_text("LOW, HIGH = 0.1, 0.2\n")
+  (tmp_path / "ranged.py").write_text(
+    "import ranges\nfrom apnpql_jax.tasks.stack_box import StackBox\n"
+    "class Ranged(StackBox): pass\n"
+  )
+  (tmp_path / ".#ranged.py").symlink_to("user@host.1")  # Emacs edits the file.
+  mine = importlib.import_module("ranged").Ranged()
+  name = reset_bank._file_name(mine, 16, 0)
+  assert name == reset_bank._file_name(mine, 16, 0)
+  ranges.write_text("LOW, HIGH = 0.1, 0.3\n")
+  assert name != reset_bank._file_name(mine, 16, 0)
+
+
 BUILD = """
 import multiprocessing, threading, time
 from apnpql_jax.primitives.reset_bank import build_bank
