@@ -46,6 +46,7 @@ SEED = 0  # of the banks that training and its evaluations use
 CHUNK = 32
 MAX_DRAWS = 20  # per row before the task is rejected for lack of usable resets
 SETTLE_PERIODS = 4  # default control periods at rest before a draw is accepted
+SETTLED_AT_ONCE = 512  # draws; an engine keeps memory for each of its worlds
 SETTLE_SPEED = 0.05  # m/s and rad/s; above float32 contact noise (0.04)
 SETTLE_SHIFT = 0.005  # m; an object that settles further away overlapped with another
 MAX_TRAVEL = 2.5  # rad; turning further, a joint would pass through another branch
@@ -198,9 +199,14 @@ def _settled(
   state = physics.initial_state(task.scene, *draw)
   substeps = round(EnvConfig.control_period_s / task.scene.model.opt.timestep)
   engine = NativePhysics(task.scene, substeps=substeps)
-  closed = state.qpos[:, task.scene.gripper_qpos] > 0.5
-  for _ in range(SETTLE_PERIODS):
-    state = engine.step(state, jnp.zeros((count, 6)), closed.astype(jnp.float32))
+  parts = []
+  for start in range(0, count, SETTLED_AT_ONCE):
+    part = jax.tree.map(lambda x: x[start : start + SETTLED_AT_ONCE], state)  # noqa: B023
+    closed = (part.qpos[:, task.scene.gripper_qpos] > 0.5).astype(jnp.float32)
+    for _ in range(SETTLE_PERIODS):
+      part = engine.step(part, jnp.zeros((len(closed), 6)), closed)
+    parts.append(part)
+  state = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
   restless = np.abs(np.asarray(state.qvel)).max(-1) > SETTLE_SPEED
   model = task.scene.model
   for address in model.jnt_qposadr[free_joints(model)]:

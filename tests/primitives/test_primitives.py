@@ -129,6 +129,19 @@ def test_draws_settle_for_four_control_periods(timestep):
   np.testing.assert_allclose(state.time, physics.START_TIME + 0.6, rtol=1e-5)
 
 
+def test_draws_settle_alike_in_parts(task, monkeypatch):
+  def settled():
+    rng, report = np.random.default_rng(0), reset_bank.BankReport()
+    return jax.tree.leaves(reset_bank._settled(task, rng, 10, report)), report.drawn
+
+  whole, drawn = settled()
+  monkeypatch.setattr(reset_bank, "SETTLED_AT_ONCE", 4)
+  parts, drawn_in_parts = settled()
+  assert drawn == drawn_in_parts == 10
+  for one, other in zip(whole, parts, strict=True):
+    np.testing.assert_array_equal(one, other)
+
+
 def test_a_base_class_in_another_file_is_part_of_the_banks_name(tmp_path, monkeypatch):
   monkeypatch.syspath_prepend(tmp_path)
   base = tmp_path / "bases.py"

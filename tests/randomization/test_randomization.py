@@ -354,6 +354,16 @@ def _episodes(env: Env, *, seed: int = 0) -> EnvState:
   return jax.tree.map(lambda *x: np.stack(x), *states)
 
 
+def test_a_plain_world_is_plain_after_randomized_ones(task, drawn):
+  """Although C MuJoCo keeps the fields of the worlds that it has stepped."""
+  step = engines.make_physics("native", task.scene, substeps=30).step
+  moving, closed = jnp.full((WORLDS, 6), 0.5), jnp.ones(WORLDS)
+  plain = _states(task)
+  before = step(plain, moving, closed)
+  assert _bits(step(drawn, moving, closed).qvel) != _bits(before.qvel)
+  assert _bits(step(plain, moving, closed)) == _bits(before)
+
+
 def test_zero_ranges_equal_no_randomization(plain_env):
   plain = dataclasses.replace(
     CONFIG, obs="pixels", global_size=(12, 16), wrist_size=(8, 12)
