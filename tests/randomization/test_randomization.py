@@ -168,6 +168,34 @@ def test_a_camera_on_a_stand_shifts_as_one_in_the_world():
   assert 0.5 * ALL.camera_shift < shift.max() <= 1.001 * ALL.camera_shift
 
 
+def test_one_factor_changes_the_friction_of_all_contacts():
+  """Also of those by masks: here the plate lies on the table and on a shelf in it."""
+
+  def add(spec: mujoco.MjSpec) -> None:
+    shelf = spec.worldbody.add_geom(name="shelf", type=mujoco.mjtGeom.mjGEOM_BOX)
+    shelf.size, shelf.pos, shelf.conaffinity = [0.1] * 3, [0.5, -0.2, -0.0999], 1
+    spec.geom("plate_base").contype = 1
+
+  scene = load_scene(mjcf_path("push_plate"), variants=[add])
+  state = randomized(scene, dataclasses.replace(NONE, friction=ALL.friction))
+  factors = []
+  for world in range(WORLDS):
+    frictions = []
+    for fields in ({}, state.fields):
+      model = copy.copy(scene.model)
+      for name, value in fields.items():
+        getattr(model, name)[:] = value[world]
+      data = mujoco.MjData(model)
+      data.qpos[:] = scene.keyframe("neutral")
+      mujoco.mj_forward(model, data)
+      frictions.append(data.contact.friction.copy())
+    touching = {scene.model.geom(geom).name for geom in data.contact.geom.flat}
+    assert touching == {"plate_base", "table", "shelf"}
+    factors.append(np.divide(*frictions[::-1]))
+    np.testing.assert_allclose(factors[-1], factors[-1][0, 0], rtol=1e-5)
+  assert np.ptp([factor[0, 0] for factor in factors]) > 0.5 * ALL.friction
+
+
 def test_inertia_is_proportional_to_mass(task):
   """Without changes of size or shape; the robot keeps its mass."""
   model = task.scene.model
