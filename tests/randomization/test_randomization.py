@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from apnpql_jax.cli.new_task import NewTask, new_task
 from apnpql_jax.config.files import mjcf_path
 from apnpql_jax.config.ranges import RandomizationConfig
 from apnpql_jax.config.schema import EnvConfig
@@ -380,6 +381,26 @@ def _episodes(env: Env, *, seed: int = 0) -> EnvState:
   for key in jax.random.split(jax.random.key(seed), 8):
     states.append(env.step(states[-1], env.expert_action(states[-1]), key))
   return jax.tree.map(lambda *x: np.stack(x), *states)
+
+
+def test_a_scene_without_free_bodies_is_randomized(tmp_path):
+  """Such as the guide's, in which a ball hangs in the air."""
+  new_task(NewTask(name="touch_ball", folder=tmp_path))
+  scene = load_scene(tmp_path / "touch_ball.xml")
+  assert not free_bodies(scene.model).any()
+  state = randomized(scene, ALL)
+  changed = set().union(*CHANGES.values()) - {"pair_friction"}  # It has no pairs.
+  still = SIZES | CHANGES["mass"]
+  for name in changed - still:
+    assert len(np.unique(np.asarray(state.fields[name]), axis=0)) > 1, name
+  for name in still:
+    expected = np.broadcast_to(getattr(scene.model, name), state.fields[name].shape)
+    np.testing.assert_allclose(state.fields[name], expected, rtol=1e-6)
+  step = engines.make_physics("native", scene, substeps=30).step
+  state = state.replace(mocap_quat=state.mocap_quat.at[..., 0].set(1.0))
+  after = step(state, jnp.full((WORLDS, 6), 0.2), jnp.ones(WORLDS))
+  assert all(np.isfinite(x).all() for x in jax.tree.leaves(after))
+  assert len(np.unique(np.asarray(after.qvel[:, :6]), axis=0)) == WORLDS
 
 
 def test_a_plain_world_is_plain_after_randomized_ones(task, drawn):
