@@ -60,7 +60,7 @@ class Explanation(struct.PyTreeNode):
   """Temperature of the state."""
 
   kl: Float[Array, "*b"]
-  """KL divergence from the policy to the regularizer, nats."""
+  """KL(q, b), or KL(pi, b) in rows that project by the reverse KL; nats."""
 
   ess: Float[Array, "*b"]
   """Effective sample size of ``weights``, between 1 and S."""

@@ -7,7 +7,7 @@ bp (the rest of the prior) and policy.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import dataclasses
 import math
 from typing import Any
@@ -75,16 +75,21 @@ def make_networks(
   ``value_head`` and ``value`` are those of the policy evaluation.
   """
   hidden, learned_mean = config.hidden, config.prior_mean == "learned"
-  own = config.policy_components
   modules = {
     "encoder": Encoder(config),
     "ap": MLP(hidden, NUM_PRIMITIVES * ACTION_DIM),
-    "bp": MLP(hidden, NUM_PRIMITIVES * mixture_size(own_mean=learned_mean)),
+    "bp": _mixture(hidden, NUM_PRIMITIVES, own_mean=learned_mean),
     "z": value_head,
     "alpha": Constant() if config.temperature == "shared" else MLP(hidden, 1),
-    "policy": MLP(hidden, own * mixture_size(own_mean=True), spread_means(own)),
+    "policy": _mixture(hidden, config.policy_components, own_mean=True),
   }
   return Networks({k: modules[k] for k in groups}, value, config)
+
+
+def _mixture(hidden: Sequence[int], num: int, *, own_mean: bool) -> MLP:
+  """Builds the head of a mixture of ``num`` components."""
+  size = num * mixture_size(own_mean=own_mean)
+  return MLP(hidden, size, spread_means(num) if own_mean else nn.initializers.zeros)
 
 
 @dataclasses.dataclass(frozen=True)

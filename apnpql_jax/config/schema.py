@@ -222,8 +222,8 @@ class AgentConfig:
   """Upper bound of each joint's standard deviation in the parametric policy (rad/s)."""
 
   policy_min_prob: float = 0.001
-  """Lower bound of gripper probabilities in the parametric policy and, within a factor
-  of 2, of its component weights."""
+  """Lower bound of gripper probabilities in the parametric policy, also in ap_cem's,
+  and, within a factor of policy_components - 1, of its component weights."""
 
   policy_components: int = codec.added(1)
   """Gaussian components of the parametric policy, one in the paper; their means start

@@ -42,7 +42,7 @@ class Instants(struct.PyTreeNode):
   stage: Array  # i32[time, worlds]: index into ``PRIMITIVES``
   error: Array  # f32[time, worlds, 3]: mean error of each predicted primitive, rad/s
   gripper: Array  # bool[time, worlds, 3]: the predicted gripper command is wrong
-  kl: Array  # f32[time, worlds]: KL of the policy to its regularizer, nats
+  kl: Array  # f32[time, worlds]: KL(q, b), or KL(pi, b) with a reverse KL; nats
   alpha: Array  # f32[time, worlds]
   q: Array  # f32[time, worlds]: of the chosen action
 
@@ -136,6 +136,7 @@ def make_recorder(
     def period(carry, key):
       state, running = carry
       act_key, env_key = jax.random.split(key)
+      running &= state.faults == 0  # What follows is another episode.
       action, now = at(params, state, act_key)
       now = now.replace(active=running & now.active, solved=running & now.solved)
       return (env.step(state, action, env_key), now.active), now

@@ -109,8 +109,8 @@ def evaluate(
     step: Step of the checkpoint; the newest if None.
     acting: Rule that chooses actions, see ``agents/acting.py``; that of the run's
       evaluations if None.
-    bank_seed: Seed of the reset states. Another than the default draws states on which
-      nothing was trained or chosen, as many as there are episodes.
+    bank_seed: Seed of the reset states. Those of the default were used by evaluations
+      during training; any other draws new ones, as many as there are episodes.
     video: File for a video of the first episodes; failures to write are only printed.
 
   Returns:
@@ -126,6 +126,11 @@ def evaluate(
   config, env, agent, params, step = load_trained(
     run_dir, backend=backend, step=step, bank_seed=bank_seed, held_out=episodes
   )
+  if episodes > env.held_out:
+    print_line(
+      f"{episodes:,} episodes repeat {env.held_out:,} held-out reset states; "
+      "another bank seed draws as many as there are episodes"
+    )
   acting = acting or config.eval_acting
   play = make_player(env, lambda params: agent_policy(agent, params, acting=acting))
   played = play_held_out(env, play, params, episodes=episodes, seed=seed)

@@ -333,6 +333,13 @@ def test_bfloat16_candidates_have_nearly_the_values_of_float32(algorithm: str):
   rounded = networks.value(heads.z(actions, precision="bfloat16"))
   error, spread = jnp.abs(rounded - exact), jnp.ptp(exact)
   assert 0.0 < error.max() < 0.01 * spread
+  # Policies with a reverse KL follow the slope of Q.
+  exact, rounded = (
+    jax.grad(lambda a, p=p: networks.value(heads.z(a, precision=p)).sum())(actions)
+    for p in ("float32", "bfloat16")
+  )
+  error = jnp.linalg.norm(rounded - exact, axis=-1)
+  assert jnp.median(error / jnp.linalg.norm(exact, axis=-1)) < 0.02
 
 
 def test_fresh_networks_predict_the_configured_start():

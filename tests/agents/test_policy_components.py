@@ -216,8 +216,10 @@ def test_by_the_forward_kl_one_component_misses_both_peaks_and_three_keep_both()
   assert three.min() > 0.1 and three.sum() > 0.9
 
 
-def test_components_start_apart_with_equal_weights():
-  policy = heads_of(4, policy_components=3).policy()
+@pytest.mark.parametrize("head", ["policy", "prior"])
+def test_components_start_apart_with_equal_weights(head: str):
+  heads = heads_of(4, policy_components=3, prior_mean="learned")
+  policy = getattr(heads, head)()
   assert policy.logits.shape == (4, 3)
   np.testing.assert_allclose(jax.nn.softmax(policy.logits), 1.0 / 3.0, atol=0.02)
   apart = policy.loc[:, [0, 0, 1]] - policy.loc[:, [1, 2, 2]]
@@ -225,14 +227,17 @@ def test_components_start_apart_with_equal_weights():
   assert np.abs(policy.loc).max() < 1.0
 
 
-def test_weights_of_components_cannot_vanish():
-  heads = heads_of(4, policy_components=3)
+@pytest.mark.parametrize("num", [2, 3, 8])
+@pytest.mark.parametrize("others", [0.0, 50.0])
+def test_weights_of_components_cannot_vanish(num: int, others: float):
+  heads = heads_of(4, policy_components=num)
   psi = jax.tree.map(jnp.zeros_like, heads.params["policy"])
-  bias = psi["out"]["bias"].reshape(3, -1)
+  bias = psi["out"]["bias"].reshape(num, -1)
   # Per component: six means, 21 entries of the Cholesky factor, weight and gripper.
-  assert bias.shape == (3, 29)
-  psi["out"]["bias"] = bias.at[:, 27].set(jnp.array([50.0, 0.0, -50.0])).reshape(-1)
+  assert bias.shape == (num, 29)
+  raw = jnp.full(num, others).at[0].set(50.0).at[-1].set(-50.0)
+  psi["out"]["bias"] = bias.at[:, 27].set(raw).reshape(-1)
   moved = dataclasses.replace(heads, params={**heads.params, "policy": psi})
   least = jax.nn.softmax(moved.policy().logits).min()
   limit = heads.config.policy_min_prob
-  assert 0.5 * limit <= least <= limit
+  assert 0.99 * limit / (num - 1) <= least <= 1.01 * limit

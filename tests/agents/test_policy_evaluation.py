@@ -52,10 +52,10 @@ def test_retrace_without_correction_is_the_n_step_return():
   np.testing.assert_allclose(ours, expected, rtol=1e-5, atol=1e-5)
 
 
-def agent_with(algorithm: str, evaluation: str):
+def agent_with(algorithm: str, evaluation: str, **settings: Any):
   """Returns the agent, its row, and parameters whose values depend on the action."""
   config = dataclasses.replace(
-    CONFIG, algorithm=algorithm, policy_evaluation=evaluation
+    CONFIG, algorithm=algorithm, policy_evaluation=evaluation, **settings
   )
   agent = make_agent(config)
   params = jax.jit(agent.networks.init)(
@@ -71,10 +71,13 @@ def test_retrace_is_rejected_for_a_policy_without_density():
     agent_with("ap_cem", "retrace")
 
 
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 @pytest.mark.parametrize("algorithm", ["svg_prior", "ap_npql"])
-def test_retrace_over_windows_is_the_sum_over_its_definition(algorithm: str):
+def test_retrace_over_windows_is_the_sum_over_its_definition(
+  algorithm: str, precision: str
+):
   """Sums Munos et al., Eq. 4, forward in time for one window after the other."""
-  agent, row, params = agent_with(algorithm, "retrace")
+  agent, row, params = agent_with(algorithm, "retrace", candidate_precision=precision)
   batch = random_batch(3, BATCH, windows=N)
   key = jax.random.key(1)
 
@@ -83,7 +86,7 @@ def test_retrace_over_windows_is_the_sum_over_its_definition(algorithm: str):
   heads = agent.networks.at(params, window.timestep.observation)
   policy = row.policy(heads, row.regularizer(heads, heads), key, num_samples=6)
   values = np.sum(policy.weights * policy.q_values, axis=0)
-  q = heads.q(window.action[None])
+  q = agent.networks.value(heads.z(window.action[None], precision=precision))
   if algorithm == "svg_prior":
     log_pi = heads.policy().log_prob(window.action[None])[0]
   else:

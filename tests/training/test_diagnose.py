@@ -71,6 +71,15 @@ def test_an_episode_begins_with_the_way_to_the_object(recorded):
   np.testing.assert_array_equal(instants.stage[0], 0)
 
 
+def test_a_world_that_breaks_does_not_count_its_next_episode(recorded):
+  """Weights that are not finite break every world in its first period."""
+  agent, params, *_ = recorded
+  record = make_recorder(make_env(testing.TINY.env), agent, testing.TINY.agent)
+  broken = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), params)
+  instants = record(broken, jnp.arange(WORLDS), jax.random.key(0))
+  np.testing.assert_array_equal(instants.active.sum(0), 1)
+
+
 def hand_made() -> Instants:
   """Three worlds: solved after two actions; lost after the goal; never gripped."""
   active = np.array([[1, 1, 1], [1, 1, 1], [0, 1, 1], [0, 0, 0]], bool)

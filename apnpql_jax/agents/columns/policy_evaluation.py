@@ -18,7 +18,7 @@ from jaxtyping import Float
 import numpy as np
 
 from apnpql_jax.agents import losses
-from apnpql_jax.agents.columns.candidates import Candidates
+from apnpql_jax.agents.columns.candidates import Candidates, score
 from apnpql_jax.agents.layers import TwinValueHeads, ValueHead
 from apnpql_jax.agents.networks import Heads
 from apnpql_jax.config.schema import AgentConfig
@@ -143,7 +143,7 @@ class Retrace(TD0):
     step = window.timestep
     heads, policy = policy_at(step.observation)
     actions = window.action[None]
-    q_t = heads.q(actions)
+    q_t = score(heads, actions)[2]
     ratio = jnp.exp(policy.log_prob(actions, q_t)[0] - window.log_prob)
     return losses.retrace_target(
       step.reward,

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Float, PRNGKeyArray
 
 from apnpql_jax.agents import losses
-from apnpql_jax.agents.columns.candidates import Candidates
+from apnpql_jax.agents.columns.candidates import Candidates, score
 from apnpql_jax.agents.columns.policy import parametric
 from apnpql_jax.agents.networks import Heads
 from apnpql_jax.dists.action import ActionDistribution, UniformBox
@@ -69,7 +69,7 @@ def fit_advantageous(
   # Other draws than those of the policy update, which splits the key in two.
   key = jax.random.fold_in(key, 2)
   policy = parametric(heads, prior, key, num_samples=heads.config.policy_samples)
-  good = heads.q(samples) >= policy.value[None]
+  good = score(heads, samples)[2] >= policy.value[None]
   return _fit(heads, prior, samples, good.astype(samples.dtype), nu)
 
 
