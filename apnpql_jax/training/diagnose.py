@@ -42,6 +42,7 @@ class Instants(struct.PyTreeNode):
   stage: Array  # i32[time, worlds]: index into ``PRIMITIVES``
   error: Array  # f32[time, worlds, 3]: mean error of each predicted primitive, rad/s
   gripper: Array  # bool[time, worlds, 3]: the predicted gripper command is wrong
+  against: Array  # bool[time, worlds]: the action's command is not that of the expert
   kl: Array  # f32[time, worlds]: KL(q, b), or KL(pi, b) with a reverse KL; nats
   alpha: Array  # f32[time, worlds]
   q: Array  # f32[time, worlds]: of the chosen action
@@ -71,8 +72,10 @@ def diagnose(
     solved: Episodes solved by each acting rule, see ``agents/acting.py``.
     failures: Failed episodes by their last stage. "object after goal" is an object that
       was lost.
-    stages: For each stage, the share of instants, the error of each primitive (rad/s)
-      and the share of wrong gripper commands of the primitive in use.
+    stages: For each stage, the share of instants, the error of each primitive (rad/s),
+      the share of wrong gripper commands of the primitive in use, and the share of
+      actions whose command is not the expert's. If only the latter is high, Q and the
+      M-step overrule the primitives.
     kl_over_epsilon, alpha: Quantiles over instants.
     calibration: In groups of instants of equal size, the mean Q of the actions and the
       mean return, which is zero in failed episodes.
@@ -120,12 +123,14 @@ def make_recorder(
     predicted, label = heads.primitives(), state.timestep.primitives
     # The last component is a logit in the prediction and a command in the label.
     wrong = (predicted[..., ARM_DOF] > 0.0) != (label[..., ARM_DOF] > 0.5)
+    command = env.expert_action(state)[..., ARM_DOF]
     return action, Instants(
       active=~state.timestep.last,
       solved=state.timestep.terminated,
       stage=expert_stage(env, state),
       error=_arm_error(predicted, label),
       gripper=wrong,
+      against=action[..., ARM_DOF] != command,
       kl=algorithm.policy_update(heads, prior, kl_key).kl,
       alpha=info["alpha"],
       q=info["q"],
@@ -170,6 +175,7 @@ def summarize(instants: Instants, config: AgentConfig) -> dict[str, Any]:
       stages[name] = {"share": float(here.sum() / active.sum())}
       stages[name] |= {f"{primitive}_error": float(x) for primitive, x in errors}
       stages[name]["wrong_gripper"] = float(instants.gripper[here][:, index].mean())
+      stages[name]["against_expert"] = float(instants.against[here].mean())
   # Control periods until the reward, which comes with the last action.
   wait = active.sum(axis=0) - 1 - np.arange(len(active))[:, None]
   returns = np.where(solved, config.gamma ** np.maximum(wait, 0), 0.0)[active]

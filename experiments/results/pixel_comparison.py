@@ -6,8 +6,8 @@
       --rows ap_mpo_mixture ap_sac_mixture
 
 See ``comparison``. A row has the preset of the task, with its environment steps,
-updates and candidates. Settings of the rows are those that a search from states found
-(experiments/log.md, sac1 to sac4).
+updates and candidates. Settings of the rows are those of the trials that solve most in
+``search``.
 """
 
 from __future__ import annotations
@@ -16,10 +16,25 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from comparison import PAPER, Comparison, Row
-import state_comparison
+from comparison import Comparison, Row
 
-ROWS = {name: state_comparison.ROWS[name] for name in PAPER}
+ROWS = {
+  "ap_npql": Row("ap_npql"),
+  "ap_mpo": Row(
+    "ap_mpo",
+    "--agent.policy-initial-std 0.05 --agent.min-alpha 0.0028 "
+    "--agent.learning-rate-e 0.00061 --agent.epsilon 2.6 --agent.policy-max-std 0.12",
+  ),
+  "ap_sac": Row(
+    "ap_sac",
+    "--agent.policy-initial-std 0.05 --agent.epsilon 50 --agent.min-alpha 0.001",
+  ),
+  "sac": Row(
+    "sac",
+    "--agent.min-alpha 0.0054 --agent.learning-rate-e 0.00044 --agent.epsilon 7.2 "
+    "--agent.policy-initial-std 0.25",
+  ),
+}
 # What a parametric policy costs: its projection, or that it is a single Gaussian? Here
 # it has as many components as the prior.
 ROWS |= {

@@ -4,7 +4,7 @@
   python experiments/results/search.py --rows ap_mpo_1 ap_mpo_2
 
 See ``comparison``. The budget is the same for every algorithm: the settings of
-``pixel_comparison`` (row_0) and TRIALS points of a Latin hypercube over four settings
+``state_comparison`` (row_0) and TRIALS points of a Latin hypercube over four settings
 (row_1, ...), on push_plate with one seed. The preset itself was made for AP-NPQL over
 many logged trials, which no budget here makes up for. What counts is success by draws,
 from reset states that neither training nor ``pixel_comparison`` uses.

@@ -52,6 +52,18 @@ def test_errors_are_those_of_the_predicted_primitives(recorded):
   np.testing.assert_array_equal(instants.gripper[0], wrong)
 
 
+def test_commands_against_the_expert_are_those_of_the_actions(recorded):
+  agent, params, state, instants = recorded
+  key = jax.random.split(jax.random.key(1), len(instants.active))[0]
+  for _ in range(2):  # The first of two is for the policy, of these for the action.
+    key = jax.random.split(key)[0]
+  action, _ = agent.act(params, state.observation, key)
+  expert = make_env(testing.TINY.env).expert_action(state)
+  against = np.asarray(action[:, 6] != expert[:, 6])
+  assert against.any()
+  np.testing.assert_array_equal(instants.against[0], against)
+
+
 def test_means_do_not_depend_on_the_key(recorded):
   """Draws do, so that the acting rule shows."""
   agent, params, *_ = recorded
@@ -89,6 +101,7 @@ def hand_made() -> Instants:
   error = np.broadcast_to(np.array([0.1, 0.2, 0.3]), (4, 3, 3)) * (1 + stage[..., None])
   gripper = np.zeros((4, 3, 3), bool)
   gripper[1, 0, 1] = True  # One of the two instants of the stage "goal".
+  against = (stage == 0) & active & (np.arange(3) == 2)  # Half of those of "object".
   q = np.array([[0.9, 0.2, 0.0], [1.0, 0.3, 0.1], [9.0, 0.4, 0.15], [9.0, 9.0, 9.0]])
   arrays: Any = {
     "active": active,
@@ -96,6 +109,7 @@ def hand_made() -> Instants:
     "stage": stage,
     "error": error,
     "gripper": gripper,
+    "against": against,
     "kl": np.where(active, 2.0, np.nan),
     "alpha": np.where(active, 0.5, np.nan),
     "q": q,
@@ -111,6 +125,8 @@ def test_the_summary_of_hand_made_episodes():
   assert found["stages"]["goal"]["goal_error"] == pytest.approx(0.4)
   assert found["stages"]["goal"]["wrong_gripper"] == 0.5
   assert found["stages"]["object"]["wrong_gripper"] == 0.0
+  assert found["stages"]["object"]["against_expert"] == 0.5
+  assert found["stages"]["goal"]["against_expert"] == 0.0
   assert set(found["kl_over_epsilon"].values()) == {0.5}
   assert set(found["alpha"].values()) == {0.5}
   # The reward comes with the second action: 1 there, gamma before.
