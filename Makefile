@@ -38,7 +38,8 @@ cuda: $(VENV)/.runtime
 	$(PIP) install --no-build-isolation --constraint requirements.lock -e '.[cuda]'
 
 clean:
-	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis build dist
+	if [ -e $(VENV)/.make ] || [ -e $(VENV)/.python ]; then rm -rf $(VENV); fi
+	rm -rf .pytest_cache .ruff_cache .hypothesis build dist
 	find apnpql_jax benchmarks docs experiments tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Training needs only the first lock; what the tests add comes with the first test.
@@ -56,13 +57,19 @@ $(VENV)/.docs: requirements-docs.lock | $(VENV)/.python
 	$(PIP) install --quiet --no-deps --requirement requirements-docs.lock
 	@touch $@
 
-# 3.11 first: it is the version the locks were made with.
+# The marker .make comes first: what an interrupted call has left is replaced, and nothing
+# else. Python 3.11 comes first, because it is the version the locks were made with.
 $(VENV)/.python:
-	@rm -rf $(VENV); \
+	@if [ -e $(VENV) ] && [ ! -e $(VENV)/.make ]; then \
+	  echo "$(VENV) was not made by make, or not finished; move it away or remove it" >&2; \
+	  exit 1; \
+	fi; \
+	rm -rf $(VENV); \
 	for python in $(PYTHON) python3.11 python3.12 python3.13 python3.14 python3; do \
 	  if "$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then \
 	    echo "making $(VENV) with $$python (several minutes the first time)"; \
-	    "$$python" -m venv $(VENV) && touch $@ && exit 0; \
+	    mkdir -p $(VENV) && touch $(VENV)/.make && "$$python" -m venv $(VENV) && \
+	      touch $@ && exit 0; \
 	    rm -rf $(VENV); \
 	    echo "$$python cannot make a virtual environment; install its venv module" >&2; \
 	    exit 1; \

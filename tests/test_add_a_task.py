@@ -9,6 +9,8 @@ import re
 import subprocess
 import sys
 
+import pytest
+
 from apnpql_jax import testing
 
 ROOT = testing.ROOT
@@ -85,6 +87,42 @@ def test_the_task_of_the_guide_runs(tmp_path: Path):
   (tmp_path / "touch_ball.py").rename(tmp_path / "moved.py")
   assert "touch_ball.py, which is missing" in refusal(tmp_path, *evaluate)
   assert "no file 'touch_ball.py'" in refusal(tmp_path, *evaluate, *given)
+
+
+SETTINGS = """
+import sys
+from apnpql_jax.cli import commands, main, sweep
+from apnpql_jax.cli.options import Train
+from apnpql_jax.config.checks import validate
+from apnpql_jax.tasks import task_names
+
+trained = commands.with_shortcuts(main._parse(Train, sys.argv[1:]))
+validate(trained, tasks=task_names())
+assert trained == sweep.config_of(sys.argv[2:])
+print(trained.env.task, trained.env.task_file)
+"""
+
+
+@pytest.mark.parametrize("given", ["--task-file ball.py", "--task-file=./ball.py"])
+def test_a_preset_may_have_its_task_in_another_file(given, tmp_path: Path):
+  result(tmp_path, "new-task", "touch_ball")
+  task = (tmp_path / "touch_ball.py").read_text()
+  (tmp_path / "ball.py").write_text(task[: task.index("_PUSH = ")])
+  (tmp_path / "mine.py").write_text(
+    "from apnpql_jax import load_preset, tasks\n"
+    "assert 'touch_ball' in tasks.task_names()\n"
+    "CONFIG = load_preset('push_plate')\n"
+  )
+  line = ["train", "./mine.py", "--env.task", "touch_ball", *given.split()]
+  done = subprocess.run(
+    [sys.executable, "-c", SETTINGS, *line],
+    cwd=tmp_path,
+    env=dict(os.environ, PYTHONPATH=str(ROOT)),
+    capture_output=True,
+    text=True,
+  )
+  assert done.returncode == 0, done.stderr
+  assert done.stdout.split() == ["touch_ball", str(tmp_path / "ball.py")]
 
 
 def test_a_name_whose_files_could_not_be_loaded_is_refused(tmp_path: Path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import metadata
 import json
 import os
 from pathlib import Path
@@ -125,10 +126,63 @@ def test_lock_satisfies_the_requirements_of_the_project(lock, wanted):
     assert found.marker == requirement.marker
 
 
+EXPORT = """
+import sys
+sys.modules.update(dict.fromkeys(sys.argv[1:]))  # As if they were not installed.
+import jax
+made = jax.export.export(jax.jit(lambda x: 2 * x))(1.0).serialize()
+print(jax.export.deserialize(made).call(3.0))
+"""
+
+
+def test_the_lock_of_the_runtime_suffices_for_exported_programs(tmp_path):
+  """``robot run`` plays them after ``make``, without an extra."""
+  runtime_has = locked("requirements.lock").keys()
+  others = [
+    module
+    for module, packages in metadata.packages_distributions().items()
+    if runtime_has.isdisjoint(map(canonicalize_name, packages))
+  ]
+  assert "pytest" in others
+  assert python(ROOT, tmp_path, "-c", EXPORT, *others) == "6.0\n"
+
+
 def test_the_workflow_caches_what_the_tests_compile():
   workflow = (ROOT / ".github" / "workflows" / "checks.yml").read_text()
   cache = runtime.cache_dir()
   assert cache is not None and f"path: {cache.relative_to(ROOT)}\n" in workflow
+
+
+def make(folder: Path, *args: str) -> subprocess.CompletedProcess[str]:
+  """Calls make with the Makefile of the project in another folder."""
+  command = ["make", "-f", str(ROOT / "Makefile"), "-C", str(folder), *args]
+  return subprocess.run(command, capture_output=True, text=True)
+
+
+def test_make_leaves_an_environment_alone_that_it_has_not_made(tmp_path):
+  mine = tmp_path / ".venv" / "mine.txt"
+  mine.parent.mkdir()
+  mine.touch()
+  made = make(tmp_path, ".venv/.python", f"PYTHON={sys.executable}")
+  first = made.stderr.splitlines()[0]
+  assert made.returncode == 2 and first.startswith(".venv was not made by make")
+  make(tmp_path, "clean")
+  assert [*mine.parent.iterdir()] == [mine]
+
+
+def test_make_replaces_an_environment_that_it_has_not_finished(tmp_path):
+  python, venv = tmp_path / "python", tmp_path / ".venv"
+  python.write_text(
+    '#!/bin/sh\n[ "$1" = -c ] && exit\ntouch "$3/half"\nkill -9 $PPID\n'
+  )
+  python.chmod(0o755)
+  assert make(tmp_path, ".venv/.python", f"PYTHON={python}").returncode == 2
+  assert (venv / "half").exists()
+  made = make(tmp_path, ".venv/.python", f"PYTHON={sys.executable}")
+  assert made.returncode == 0, made.stderr
+  assert (venv / ".python").exists() and not (venv / "half").exists()
+  make(tmp_path, "clean")
+  assert not venv.exists()
 
 
 def test_mujoco_and_mjx_are_a_matched_pair():

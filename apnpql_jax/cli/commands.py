@@ -46,6 +46,8 @@ def base_config(args: Train) -> TrainConfig:
   if args.resume is not None and args.init_from is not None:
     raise ConfigError("--resume has the weights of its run; leave out --init-from")
   if args.preset and args.resume is None:
+    if args.task_file is not None:
+      user_files.load(args.task_file)  # First: the preset may need its task.
     return files.load_preset(args.preset)
   if args.resume is None:
     names = ", ".join(files.preset_names())
@@ -220,7 +222,10 @@ def list_names(args: List) -> Json:
 
 
 def with_shortcuts(args: Train) -> TrainConfig:
-  """Returns the settings with --backend, --obs and --algorithm applied."""
+  """Returns the settings with --backend, --obs and --algorithm applied.
+
+  Those of a new run name the file of its task, which may be --task-file.
+  """
 
   def updated(part: Any, **settings: str | None) -> Any:
     given = {name: value for name, value in settings.items() if value is not None}
@@ -228,7 +233,10 @@ def with_shortcuts(args: Train) -> TrainConfig:
 
   env = updated(args.config.env, backend=args.backend, obs=args.obs)
   agent = updated(args.config.agent, algorithm=args.algorithm)
-  return dataclasses.replace(args.config, env=env, agent=agent)
+  config = dataclasses.replace(args.config, env=env, agent=agent)
+  if args.task_file is None or args.resume is not None:
+    return config
+  return files.with_file(user_files.load(args.task_file), config)
 
 
 def _mesh(args: Train) -> Mesh | None:

@@ -7,6 +7,7 @@ import contextlib
 import json
 import math
 import os
+from pathlib import Path
 import signal
 import sys
 from typing import Any
@@ -24,7 +25,7 @@ from apnpql_jax.cli.plot import Plot, plot
 from apnpql_jax.cli.robot import Robot, robot
 from apnpql_jax.cli.sweep import Sweep, parse_sweep, sweep
 from apnpql_jax.cli.transfer import Transfer, transfer
-from apnpql_jax.config import files
+from apnpql_jax.config import files, user_files
 from apnpql_jax.console import Unfailing, print_line, reporting
 from apnpql_jax.errors import ConfigError, UserError, check_name
 from apnpql_jax.runs.signals import Signals
@@ -34,8 +35,8 @@ def main(argv: Sequence[str] | None = None) -> int:
   """Runs one command line and returns its exit code.
 
   0 is success, 1 a machine that `doctor` finds unfit, 2 bad input, 3 a run that had to
-  stop (disk full, non-finite updates), 130 Ctrl-C and 143 SIGTERM, with the run saved.
-  All but 0 and 1 print one line to stderr.
+  stop (disk full, non-finite updates), 129 a closed terminal, 130 Ctrl-C and 143
+  SIGTERM, with the run saved. All but 0 and 1 print one line to stderr.
   """
   _fill_closed_streams()
   args = list(sys.argv[1:] if argv is None else argv)
@@ -90,8 +91,12 @@ def _parse(kind: type[Any], args: Sequence[str]) -> Any:
   if kind is not Train:
     return parse(kind, name, rest)
   # Parsing ends here for --help, which shows the settings of a preset named before it.
-  presets = [arg for arg in rest if files.is_preset(arg)]
-  default = Train(config=files.load_preset(presets[0])) if presets else None
+  file = user_files.task_file(rest)
+  words = [arg for arg in rest if not arg.startswith("-") and Path(arg) != file]
+  default = None
+  if preset := next(filter(files.is_preset, words), ""):
+    named = Train(preset=preset, task_file=file)
+    default = Train(config=commands.base_config(named))
   base = commands.base_config(parse(Train, name, rest, default=default))
   return parse(Train, name, rest, default=Train(config=base))
 

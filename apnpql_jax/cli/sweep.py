@@ -12,7 +12,7 @@ import tyro
 
 from apnpql_jax.cli import commands
 from apnpql_jax.cli.options import Command, Count, File, Train, parse
-from apnpql_jax.config import files
+from apnpql_jax.config import files, user_files
 from apnpql_jax.config.checks import validate
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import ConfigError, UserError
@@ -107,10 +107,19 @@ def config_of(argv: Sequence[str]) -> TrainConfig:
   Raises:
     ConfigError: A setting is unknown or invalid.
   """
-  base = Train(config=files.load_preset(argv[0]))
-  config = commands.with_shortcuts(parse(Train, "train", argv, default=base))
+  return _options_of(argv).config
+
+
+def _options_of(argv: Sequence[str]) -> Train:
+  """Returns what ``config_of`` does, as the same options if runs are the same."""
+  named = Train(preset=argv[0], task_file=user_files.task_file(argv))
+  base = Train(config=commands.base_config(named))
+  args = parse(Train, "train", argv, default=base)
+  config = commands.with_shortcuts(args)
   validate(config)
-  return config
+  return dataclasses.replace(
+    args, preset="", backend=None, obs=None, algorithm=None, config=config
+  )
 
 
 def _open(args: Sweep, stack: contextlib.ExitStack) -> Manifest:
@@ -123,8 +132,7 @@ def _open(args: Sweep, stack: contextlib.ExitStack) -> Manifest:
     names = ", ".join(files.preset_names())
     raise ConfigError(f"sweep needs a preset; choose from {names}")
   plan = make_plan(args.presets, args.grid, seeds=args.seeds, options=args.train)
-  for run in plan:
-    _check(run)
+  check_plan(plan)
   folder = args.out or states.find_equal(_ROOT, plan)
   if folder is None:
     stems = (Path(preset).stem for preset in args.presets)
@@ -148,20 +156,36 @@ def check_begun(manifest: Manifest) -> None:
     began = run_folder.load_run_config(run_dir)
     if diff := differences(began, config_of(entry.argv)):
       raise ConfigError(
-        f"{run_dir} began with other settings: {files.format_diff(diff)}; remove it to "
-        "train it again, or choose another --out"
+        f"{run_dir} began with other settings: {files.format_diff(diff)}; continue "
+        f"with those: apnpql sweep --resume {manifest.folder}; or choose another "
+        "--out, or remove the run to train it again"
       )
 
 
-def _check(run: Planned) -> None:
-  """Raises ``ConfigError`` that names a run whose options cannot be meant."""
+def check_plan(plan: Sequence[Planned]) -> None:
+  """Checks the options of all runs of a plan.
+
+  Raises:
+    ConfigError: Those of a run cannot be meant, or two runs are the same.
+  """
+  names: dict[Train, str] = {}
+  for run in plan:
+    name = names.setdefault(_checked(run), run.name)
+    if name != run.name:
+      raise ConfigError(f"{name} and {run.name} are the same run; leave one out")
+
+
+def _checked(run: Planned) -> Train:
+  """Returns the options of a run; raises ``ConfigError`` that names it."""
   fixed = {"--run", "--resume", "--overwrite", "--json", "--coordinator"}
   if found := fixed & {word.partition("=")[0] for word in run.argv}:
     raise ConfigError(f"leave out {', '.join(sorted(found))}; the sweep sets it itself")
   try:
-    check_sinks(config_of(run.argv).sinks)
+    options = _options_of(run.argv)
+    check_sinks(options.config.sinks)
   except UserError as error:
     raise ConfigError(f"{run.name}: {error}") from None
+  return options
 
 
 def _launcher(args: Sweep, manifest: Manifest) -> Any:

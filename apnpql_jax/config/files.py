@@ -50,7 +50,7 @@ def load_preset(name: str) -> TrainConfig:
   """
   if user_files.is_file(name):
     module = user_files.load(name)
-    return _with_file(module, _checked(name, getattr(module, "CONFIG", None)))
+    return with_file(module, _checked(name, getattr(module, "CONFIG", None)))
   check_name("preset", name, preset_names())
   own = _names("experiments", ".py")
   if name in own:
@@ -63,8 +63,8 @@ def load_preset(name: str) -> TrainConfig:
     raise ConfigError(f"preset {name!r} fails with {reason}") from error
 
 
-def _with_file(module: ModuleType, config: TrainConfig) -> TrainConfig:
-  """Returns the preset of a file, which the settings name if it has the task, too."""
+def with_file(module: ModuleType, config: TrainConfig) -> TrainConfig:
+  """Returns settings that name the file of a module if it has their task."""
   classes = (value for value in vars(module).values() if isinstance(value, type))
   if config.env.task not in (getattr(value, "name", None) for value in classes):
     return config
@@ -120,7 +120,7 @@ def _executed(task: str) -> TrainConfig:
   for module in user_files.loaded():
     config = getattr(module, "CONFIG", None)
     if isinstance(config, TrainConfig) and config.env.task == task:
-      config = _with_file(module, config)
+      config = with_file(module, config)
       if config.env.task_file:
         return config
   return TrainConfig()

@@ -22,8 +22,8 @@ class EnvConfig:
   """Task to solve; `apnpql list` shows all."""
 
   task_file: str = codec.added("")
-  """Python file of the task if it is not installed. It is set from the path of the
-  preset, and the file is never executed because of it."""
+  """Python file of the task if it is not installed. It is set from --task-file or the
+  path of the preset, and the file is never executed because of it."""
 
   obs: str = "pixels"
   """Observations: pixels (two cameras) or state (points on the objects)."""

@@ -6,6 +6,8 @@ run folder mentions it.
 
 from __future__ import annotations
 
+import argparse
+from collections.abc import Sequence
 import hashlib
 import importlib.util
 from pathlib import Path
@@ -42,6 +44,13 @@ def check_loaded(path: str, task: str) -> None:
       f"task {task!r} is in {path}{missing}; a file is executed only if you name it: "
       f"--task-file {path}, or load_preset({path!r}) in Python"
     )
+
+
+def task_file(argv: Sequence[str]) -> Path | None:
+  """Returns the file that ``--task-file`` names on a command line, if any."""
+  parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+  parser.add_argument("--task-file", "--task_file", nargs="?", type=Path)
+  return parser.parse_known_args(argv)[0].task_file
 
 
 def load(path: Path | str) -> ModuleType:

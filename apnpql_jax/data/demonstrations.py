@@ -72,6 +72,22 @@ def join(*parts: Demonstrations) -> Demonstrations:
 
 def solved(demos: Demonstrations, task: Task, config: EnvConfig) -> np.ndarray:
   """Returns which episodes are solved within the time limit, bool[episodes]."""
+  success, _ = _judge(demos, task, config)
+  return np.logical_or.reduceat(success, np.flatnonzero(demos.first))
+
+
+def until_end(demos: Demonstrations, task: Task, config: EnvConfig) -> np.ndarray:
+  """Returns the instants up to each episode's success or time limit, i64[kept]."""
+  success, elapsed = _judge(demos, task, config)
+  earlier = np.cumsum(success) - success  # successes before each instant
+  ended = earlier > earlier[np.arange(demos.instants) - elapsed]
+  return np.flatnonzero(~ended & (elapsed <= config.episode_steps))
+
+
+def _judge(
+  demos: Demonstrations, task: Task, config: EnvConfig
+) -> tuple[np.ndarray, np.ndarray]:
+  """Returns where an episode is solved in time, and its control periods so far, [n]."""
   kinematics = make_kinematics(task.scene)
   success = jax.jit(lambda state: task.success(state, kinematics(state)))
   # Chunks of one size, which compile once.
@@ -83,8 +99,7 @@ def solved(demos: Demonstrations, task: Task, config: EnvConfig) -> np.ndarray:
   begin = np.flatnonzero(demos.first)
   elapsed = np.arange(demos.instants) - begin[np.cumsum(demos.first) - 1]
   # An episode cannot end at its first instant.
-  counts = success_now & (elapsed > 0) & (elapsed <= config.episode_steps)
-  return np.logical_or.reduceat(counts, begin)
+  return success_now & (elapsed > 0) & (elapsed <= config.episode_steps), elapsed
 
 
 def only_solved(demos: Demonstrations, task: Task, config: EnvConfig) -> Demonstrations:

@@ -49,14 +49,13 @@ def export(
     The folder and what it holds.
 
   Raises:
-    ConfigError: An argument is invalid, or a package is missing.
+    ConfigError: An argument is invalid.
     FileError: Not a run folder, no readable checkpoint, or the folder exists.
     UserError: The policy cannot be exported.
   """
   run_dir, folder = Path(run_dir), Path(folder)
   if acting is not None:
     check_name("acting", acting, ACTING)
-  program.check_available()
   check_free(folder, overwrite=overwrite)
   config = run_folder.open_run(run_dir).config
   acting = acting or config.eval_acting

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Generator
 import contextlib
 import dataclasses
-import importlib.util
 from typing import Any
 
 import jax
@@ -15,7 +14,7 @@ import numpy as np
 
 from apnpql_jax.agents.learner import Agent
 from apnpql_jax.agents.networks import Params
-from apnpql_jax.errors import ConfigError, UserError, one_line
+from apnpql_jax.errors import UserError, one_line
 from apnpql_jax.types import Array, Observation
 
 PLATFORMS = ("cpu", "cuda")
@@ -36,12 +35,6 @@ class Program:
 
   calling_convention: int
   """Version of the calling convention of ``jax.export``."""
-
-
-def check_available() -> None:
-  """Raises ``ConfigError`` if a package that ``jax.export`` needs is missing."""
-  if importlib.util.find_spec("flatbuffers") is None:
-    raise ConfigError("export needs flatbuffers: pip install 'apnpql-jax[export]'")
 
 
 def make_act(agent: Agent, params: Params, *, acting: str) -> Act:
@@ -73,7 +66,6 @@ def export(act: Act, shapes: dict[str, Any]) -> Program:
     UserError: The program calls code of this process, or something else that
       ``jax.export`` cannot store.
   """
-  check_available()
   key = jax.ShapeDtypeStruct((2,), jnp.uint32)
   try:
     with _without_locations():

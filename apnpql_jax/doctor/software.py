@@ -19,7 +19,6 @@ _EXTRAS = "extras"
 
 EXTRAS = {
   "cuda": "trains on NVIDIA GPUs",
-  "export": "apnpql export",
   "gym": "Gymnasium environments",
   "lerobot": "collect --format lerobot, convert from such datasets",
   "robot": "apnpql robot with real devices or their doubles",

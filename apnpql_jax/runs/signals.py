@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM of a run: when to finish and save, and when to end at once.
+"""Signals that stop a run: when to finish and save, and when to end at once.
 
 Python runs signal handlers between two instructions, and a compilation or a save is one
 that takes minutes. A thread therefore watches for signals that end the process at once.
@@ -26,7 +26,10 @@ _ONE_REQUEST_S = 1.0
 
 
 class Signals:
-  """Context manager that records SIGINT and SIGTERM; enter it in the main thread.
+  """Context manager that records SIGINT, SIGTERM and SIGHUP.
+
+  Enter it in the main thread. A closed terminal sends SIGHUP. Where that is ignored, as
+  under ``nohup``, it stays so.
 
   A signal ends the process at once, with a line and exit code ``INTERRUPTED`` plus its
   number, unless ``finish_first`` was called and it is the first.
@@ -48,9 +51,12 @@ class Signals:
     self._woken, self._wake = os.pipe()
     os.set_blocking(self._wake, False)  # Required by the interpreter.
     self._wake_before = signal.set_wakeup_fd(self._wake)
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+      numbers.append(signal.SIGHUP)
     self._before: dict[int, Any] = {
       number: signal.signal(number, lambda number, _: self.caught.append(number))
-      for number in (signal.SIGINT, signal.SIGTERM)
+      for number in numbers
     }
     threading.Thread(target=self._watch, daemon=True).start()
     return self

@@ -30,7 +30,8 @@ class Work(NamedTuple):
   def _not_stored(self) -> list[str]:
     """Returns the options that no run stores, so that a resume needs them again."""
     preset = self.argv[0] if self.argv else ""
-    options = ["--task-file", preset] if user_files.is_file(preset) else []
+    file = str(user_files.task_file(self.argv) or preset)
+    options = ["--task-file", file] if user_files.is_file(file) else []
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--devices")
     devices = parser.parse_known_args(self.argv)[0].devices

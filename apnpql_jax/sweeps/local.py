@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import itertools
 import os
 from pathlib import Path
 import signal
@@ -77,14 +78,13 @@ class LocalLauncher:
 
 
 def shares(items: Sequence, count: int) -> list[list]:
-  """Splits items into ``count`` shares of neighbors; few items are used repeatedly."""
-  if not items:
-    return [[] for _ in range(count)]
+  """Splits items into ``count`` shares of neighbors; few items are used repeatedly.
+
+  No item is in more than ``ceil(count / len(items))`` shares.
+  """
   size = len(items)
-  return [
-    list(items[i * size // count : (i + 1) * size // count]) or [items[i % size]]
-    for i in range(count)
-  ]
+  bounds = itertools.pairwise(i * size // count for i in range(count + 1))
+  return [list(items[start : max(start + 1, end)]) for start, end in bounds]
 
 
 def available_cores() -> list[int]:

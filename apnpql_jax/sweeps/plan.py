@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import itertools
+import os
 from pathlib import Path
 import re
 from typing import NamedTuple
@@ -11,6 +12,12 @@ from typing import NamedTuple
 from apnpql_jax.config import codec, user_files
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import ConfigError
+
+_SHORT = {"algorithm": "agent.algorithm", "backend": "env.backend", "obs": "env.obs"}
+"""Options of ``apnpql train`` that are short for a setting."""
+
+_PATHS = {"init_from", "replay.demonstrations", "task_file"}
+"""Options of ``apnpql train`` that name a file or folder."""
 
 
 class Planned(NamedTuple):
@@ -47,8 +54,8 @@ def make_plan(
     ConfigError: An axis cannot be read, or two runs would be the same.
   """
   axes = [parse_axis(text) for text in grid]
-  names = [axis.option for axis in axes]
-  given = {_name(word) for word in options if word.startswith("--")}
+  names = [_setting(axis.option) for axis in axes]
+  given = {_setting(_name(word)) for word in options if word.startswith("--")}
   if twice := sorted(given & {"seed", *names}):
     raise ConfigError(f"give {', '.join(twice)} by --grid {twice[0]}=... alone")
   if repeated := sorted({name for name in names if names.count(name) > 1}):
@@ -92,13 +99,23 @@ def _name(option: str) -> str:
   return option.partition("=")[0].strip().lstrip("-").replace("-", "_")
 
 
+def _setting(option: str) -> str:
+  """Returns the setting of an option, also of one that is short or turns it off."""
+  group, dot, last = option.rpartition(".")
+  flag = f"{group}{dot}{last.removeprefix('no_')}"
+  return flag if _is_flag(flag) else _SHORT.get(option, option)
+
+
+def _is_flag(setting: str) -> bool:
+  return isinstance(dict(codec.flatten(TrainConfig())).get(setting), bool)
+
+
 def _run(
   preset: str, chosen: Sequence[tuple[Axis, str]], options: Sequence[str]
 ) -> Planned:
   name = [_plain(Path(preset).stem)]
-  # A sweep may be continued from another folder.
   path = str(Path(preset).resolve()) if user_files.is_file(preset) else preset
-  argv = [path, *options]
+  argv = [path, *_with_absolute_paths(options)]
   for axis, value in chosen:
     short = axis.option.rpartition(".")[2]
     name.append(_plain(f"{short}_{value}"))
@@ -108,14 +125,34 @@ def _run(
 
 def _option(name: str, value: str) -> list[str]:
   """Returns a setting as options of the command line."""
-  settings = dict(codec.flatten(TrainConfig()))
   dashed = name.replace("_", "-")
-  if isinstance(settings.get(name), bool):
+  if name in _PATHS:
+    return [f"--{dashed}", _absolute(value)]
+  if _is_flag(name):
     if value.lower() not in ("true", "false"):
       raise ConfigError(f"--grid {name}={value}: {value!r} is neither true nor false")
     group, dot, last = dashed.rpartition(".")
     return [f"--{dashed}" if value.lower() == "true" else f"--{group}{dot}no-{last}"]
   return [f"--{dashed}", *value.split()]
+
+
+def _with_absolute_paths(options: Sequence[str]) -> list[str]:
+  """Returns options with absolute paths: a sweep may be continued from elsewhere."""
+  found, name = [], ""
+  for word in options:
+    option, equals, value = word.partition("=")
+    if word.startswith("--"):
+      name = _name(option)
+      word = f"{option}={_absolute(value)}" if equals and name in _PATHS else word
+    elif name in _PATHS:
+      word = _absolute(word)
+    found.append(word)
+  return found
+
+
+def _absolute(path: str) -> str:
+  """Returns an absolute path; ``RUN:STEP`` keeps its step, and "" means no file."""
+  return os.path.abspath(path) if path else ""
 
 
 def _plain(text: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+import signal
 import time
 
 from apnpql_jax.console import reporting
@@ -30,7 +31,8 @@ class Runner:
     """Trains all runs that are not done.
 
     Args:
-      caught: Signals so far; after the first, the runs save and no other starts.
+      caught: Signals so far; after the first, the runs save and no other starts. At
+        SIGHUP, from a closed terminal, jobs of a cluster continue.
       show: Called in every turn, to show the progress.
     """
     self._manifest.folder.mkdir(parents=True, exist_ok=True)
@@ -42,8 +44,7 @@ class Runner:
       while self._active or (not caught and self._waiting()):
         if caught and not stopping:
           stopping = True
-          for _, job in self._active.values():
-            job.stop()
+          self._stop(caught[0])
         if not caught:
           self._start()
         self._collect()
@@ -63,7 +64,9 @@ class Runner:
 
   def _start(self) -> None:
     """Starts waiting runs while there is room."""
-    for entry in self._waiting()[: self._launcher.jobs - len(self._active)]:
+    # More may be in progress: an earlier process may have had room for them.
+    room = max(0, self._launcher.jobs - len(self._active))
+    for entry in self._waiting()[:room]:
       entry.attempts += 1
       entry.code, entry.line = None, ""
       try:
@@ -75,6 +78,14 @@ class Runner:
       entry.job = job.name
       self._active[entry.name] = entry, job
       self._change(entry, states.RUNNING)
+
+  def _stop(self, number: int) -> None:
+    """Lets the active runs save and end, but not those that can be found again."""
+    for entry, job in list(self._active.values()):
+      if number == signal.SIGHUP and job.name:
+        del self._active[entry.name]
+      else:
+        job.stop()
 
   def _collect(self) -> None:
     """Records the runs that have ended."""
@@ -89,7 +100,8 @@ class Runner:
       entry.line = job.error or last_line(self._manifest.work(entry).log)
       if code < 0:
         entry.line = f"killed by signal {-code}; {entry.line}"
-      stopped = code > INTERRUPTED
+      # SIGTERM kills a run that has just started and does not listen yet.
+      stopped = code > INTERRUPTED or code == -signal.SIGTERM
       self._change(entry, states.STOPPED if stopped else states.FAILED)
 
   def _change(self, entry: Entry, state: str) -> None:

@@ -14,7 +14,7 @@ import signal
 import subprocess
 from typing import Any
 
-from apnpql_jax.errors import ConfigError, FileError, one_line
+from apnpql_jax.errors import INTERRUPTED, ConfigError, FileError, one_line
 from apnpql_jax.sweeps.launcher import Job, Work
 
 ALL_AT_ONCE = 1_000_000
@@ -22,6 +22,9 @@ ALL_AT_ONCE = 1_000_000
 
 DEFAULTS = {"name": "apnpql", "timeout_min": 24 * 60}
 """Settings of the jobs unless the user gives others; submitit's limit is minutes."""
+
+_TIMEOUTS = 1_000_000
+"""How often a run may reach the end of its time; submitit's default is 3."""
 
 _LOST = 1  # exit code of a job that ended without one
 
@@ -71,7 +74,7 @@ class ClusterJob(Job):
   def __init__(self, job: Any, cluster: str):
     """Wraps a job of the cluster ``slurm``, or of ``local`` processes."""
     self.name, self._job, self._cluster = job.job_id, job, cluster
-    self.error = ""
+    self.error, self._stopped = "", False
 
   def poll(self) -> int | None:
     """See ``Job.poll``."""
@@ -81,17 +84,19 @@ class ClusterJob(Job):
       return int(self._job.result())
     except Exception as error:  # Whatever the cluster did to the job.
       self.error = f"job {self.name}: {one_line(error)}"
-      return _LOST
+      return INTERRUPTED + signal.SIGTERM if self._stopped else _LOST
 
   def stop(self) -> None:
     """See ``Job.stop``; a job that still waits leaves the queue.
 
     A plain ``scancel`` would kill the run half a minute later, while it still saves.
     """
+    self._stopped = True
     if self._cluster == "local":
-      os.kill(int(self.name), signal.SIGTERM)
+      with contextlib.suppress(ProcessLookupError):  # It has just ended.
+        os.kill(int(self.name), signal.SIGTERM)
     elif self._job.state == "PENDING":
-      self._job.cancel()
+      self._job.cancel(check=False)
     else:
       subprocess.run(["scancel", "--signal=TERM", self.name], check=False)
 
@@ -131,7 +136,9 @@ class SlurmLauncher:
       )
     self.jobs, self._cluster = jobs, cluster
     try:
-      self._executor = submitit.AutoExecutor(folder, cluster=cluster)
+      self._executor = submitit.AutoExecutor(
+        folder, cluster=cluster, **{f"{cluster}_max_num_timeout": _TIMEOUTS}
+      )
       self._executor.update_parameters(**(DEFAULTS | dict(settings or {})))
     except (RuntimeError, ValueError, NameError, AssertionError) as error:
       raise ConfigError(f"--launcher slurm: {one_line(error)}") from None

@@ -18,7 +18,8 @@ from apnpql_jax.sweeps.runner import Runner
 def train(manifest: Manifest, launcher: Launcher) -> None:
   """Trains all runs that are not done, and shows a summary.
 
-  At SIGINT or SIGTERM, the runs save and end. Call it in the main thread.
+  At SIGINT, SIGTERM or SIGHUP, the runs save and end; see ``Runner.run``. Call
+  it in the main thread.
 
   Raises:
     FileError: Another process trains this sweep.

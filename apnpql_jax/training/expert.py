@@ -69,9 +69,10 @@ def replay_from_demonstrations(
 ) -> Replay:
   """Returns an expert replay made from demonstrations.
 
-  The columns of the ring hold consecutive stretches of them, repeated or cut off to
-  fill ``replay.expert_steps`` slots. With ``env.randomize``, each episode in it draws
-  what the cameras see; the physics of a demonstration is that of its recording.
+  Instants after the first success of an episode or beyond its time limit are left out.
+  Each column of the ring holds consecutive episodes, repeated or cut off to fill
+  ``replay.expert_steps`` slots. With ``env.randomize``, each episode in it draws what
+  the cameras see; the physics of a demonstration is that of its recording.
 
   Args:
     demos: The demonstrations.
@@ -81,10 +82,10 @@ def replay_from_demonstrations(
   """
   key = jax.random.key(config.seed) if key is None else key
   worlds, length = config.env.worlds, _length(config)
-  index = np.resize(np.arange(demos.instants), (worlds, length)).T
+  kept = demonstrations.until_end(demos, env.task, env.config)
+  columns, ends = _columns(demos.first[kept], length, worlds)
+  index = kept[columns]
   slots = demos.rows(index)
-  slots.first[0] = True  # A column may begin within an episode.
-  ends = np.append(demos.first[1:], True)[index]
   targets = np.zeros((length, worlds, 3, 6), np.float32)
   targets[slots.first] = demonstrations.solve_targets(
     demos, index[slots.first], env.task
@@ -124,6 +125,25 @@ def replay_from_demonstrations(
   # The fields that are drawn are fewer than those of the worlds.
   start = start.replace(physics=states(slots.rows(np.array(0)), episode[0]))
   return remake(start, slots, targets, ends, episode)
+
+
+def _columns(
+  first: np.ndarray, length: int, worlds: int
+) -> tuple[np.ndarray, np.ndarray]:
+  """Returns which instants the columns hold, and where episodes end, [length, worlds].
+
+  A column begins where an episode does, since only there its time and the targets of
+  its primitives are known: with the episode that the column before cut off, or with the
+  next one if a column is shorter than an episode.
+  """
+  begin, last = np.flatnonzero(first), np.append(first[1:], True)
+  episode, columns = 0, []
+  for _ in range(worlds):
+    columns.append((begin[episode] + np.arange(length)) % len(first))
+    whole = int(last[columns[-1]].sum())
+    episode = (episode + max(whole, 1)) % len(begin)
+  index = np.stack(columns, axis=1)
+  return index, last[index]
 
 
 def record_expert(

@@ -90,9 +90,9 @@ def train(
     init_from: ``RUN``, ``RUN:STEP`` or ``RUN:best``: another run with whose weights
       this one starts. Optimizers and replay start empty.
     mesh: Devices to train on; the default device if None.
-    handle_signals: Save and stop at SIGINT or SIGTERM. The process ends at once if
-      there is nothing to save yet, and at a second signal. Python allows this in the
-      main thread only. By default, Ctrl-C raises ``KeyboardInterrupt`` as usual.
+    handle_signals: Save and stop at SIGINT, SIGTERM or SIGHUP. The process ends at
+      once if there is nothing to save yet, and at a second signal. Python allows this
+      in the main thread only. By default, Ctrl-C raises ``KeyboardInterrupt`` as usual.
 
   Returns:
     The run folder, steps, updates and the last evaluation.
@@ -291,7 +291,7 @@ def _expert(config: TrainConfig) -> ExpertReplayMaker:
   allow = config.replay.allow_unsolved
   demos = demonstrations.load(path, task, config.env, allow_unsolved=allow)
   slots = config.replay.expert_steps
-  _print_line(f"expert replay: {demos.instants} instants of {path} fill {slots} slots")
+  _print_line(f"expert replay: {slots} slots from {demos.instants} instants of {path}")
   return functools.partial(expert.replay_from_demonstrations, demos)
 
 
@@ -312,9 +312,10 @@ def _loop(config, start, iteration, reporter, saver, signals) -> TrainState:
     skipped_updates.check(config, state, start.path)
     done = step >= config.total_steps
     rate = None
-    # Check for signals first, so that saving does not wait for an evaluation.
+    # Check for signals first, so that saving does not wait for an evaluation, unless no
+    # resume would make up for it.
     stop = devices.any_process(signals.caught)
-    if not stop and (done or _passed(before, step, config.eval_every)):
+    if done or not stop and _passed(before, step, config.eval_every):
       rate = reporter.evaluate(step, state, last=done) if reporter else None
       stop = devices.any_process(signals.caught)
     last = done or stop

@@ -216,10 +216,14 @@ def test_the_command_converts_a_log_and_a_replay_holds_it(
   loaded = demonstrations.load(out, env.task, env.config)
   for a, b in zip(loaded, demos, strict=True):
     np.testing.assert_array_equal(a, b)
-  ring = expert.replay_from_demonstrations(loaded, testing.TINY, env)
+  whole = dataclasses.replace(
+    testing.TINY.replay, expert_steps=INSTANTS * testing.TINY.env.worlds
+  )
+  config = dataclasses.replace(testing.TINY, replay=whole)
+  ring = expert.replay_from_demonstrations(loaded, config, env)
   slots = jax.tree.map(np.asarray, ring.slots)
-  length, worlds = slots.action.shape[:2]
-  index = np.resize(np.arange(INSTANTS), (worlds, length)).T
+  # Each column holds the log.
+  index = np.broadcast_to(np.arange(INSTANTS)[:, None], slots.action.shape[:2])
   np.testing.assert_array_equal(slots.action, demos.action[index])
   np.testing.assert_array_equal(slots.timestep.terminated, index == INSTANTS - 1)
   np.testing.assert_array_equal(slots.timestep.reward > 0, index == INSTANTS - 1)

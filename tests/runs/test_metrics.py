@@ -295,7 +295,7 @@ def test_curve_shows_where_the_success_rate_is(tmp_path: Path):
     assert left.any() and right.any()
     heights.append(np.nonzero(ink)[0].mean() / ink.shape[0])
   assert heights[0] < 0.35 and heights[1] > 0.6
-  assert not list(tmp_path.glob("*.part"))
+  assert [*tmp_path.iterdir()] == [path]
 
 
 def test_the_curve_band_is_the_wilson_interval():

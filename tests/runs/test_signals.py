@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 import os
 from pathlib import Path
 import signal
@@ -47,6 +48,14 @@ with Signals("nothing is saved"), run_folder.new_run_dir("a", root) as run:
 """
 
 
+@pytest.fixture(autouse=True)
+def _hears_hangups() -> Generator[None]:
+  """Undoes a ``nohup`` of the tests, which their processes would inherit."""
+  before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+  yield
+  signal.signal(signal.SIGHUP, before)
+
+
 @pytest.mark.parametrize(("work", "left"), [("none", []), ("made", ["a-1"])])
 def test_a_process_that_ends_at_once_leaves_no_empty_run_folder(tmp_path, work, left):
   command = [sys.executable, "-c", BUILDING, str(tmp_path), work]
@@ -59,10 +68,11 @@ def test_a_process_that_ends_at_once_leaves_no_empty_run_folder(tmp_path, work, 
   assert [path.name for path in tmp_path.iterdir()] == left
 
 
-def _busy(phase: str) -> subprocess.Popen[str]:
+def _busy(phase: str, *through: str) -> subprocess.Popen[str]:
   process = subprocess.Popen(
-    [sys.executable, "-c", BUSY, phase],
+    [*through, sys.executable, "-c", BUSY, phase],
     cwd=Path(__file__).parents[2],
+    stdin=subprocess.DEVNULL,
     stdout=subprocess.PIPE,
     stderr=subprocess.STDOUT,
     text=True,
@@ -81,6 +91,7 @@ def _printed(process: subprocess.Popen[str]) -> list[str]:
   [
     ("compiling", signal.SIGINT, "nothing is saved"),
     ("compiling", signal.SIGTERM, "nothing is saved"),
+    ("compiling", signal.SIGHUP, "nothing is saved"),
     ("listing", signal.SIGINT, "interrupted"),
   ],
 )
@@ -89,6 +100,15 @@ def test_with_nothing_to_save_the_first_signal_ends_the_process(phase, number, w
     process.send_signal(number)
     assert process.wait(10) == 128 + number
     assert _printed(process) == [f"apnpql: {words}"]
+
+
+def test_with_nohup_a_closed_terminal_stops_nothing():
+  with _busy("compiling", "nohup") as process:
+    process.send_signal(signal.SIGHUP)
+    with pytest.raises(subprocess.TimeoutExpired):
+      process.wait(1.5)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(10) == 128 + signal.SIGTERM
 
 
 def test_a_second_signal_does_not_wait_but_one_sent_twice_is_one():
@@ -124,11 +144,12 @@ def test_the_exit_code_is_right_even_if_no_line_can_be_written():
   assert done.returncode == 3
 
 
-def test_signals_are_collected_and_given_back(capfd):
-  before = signal.getsignal(signal.SIGTERM)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_signals_are_collected_and_given_back(number, capfd):
+  before = signal.getsignal(number)
   with Signals("") as signals:
     signals.finish_first("")
-    os.kill(os.getpid(), signal.SIGTERM)
-    assert signals.caught == [signal.SIGTERM]
-  assert signal.getsignal(signal.SIGTERM) == before
+    os.kill(os.getpid(), number)
+    assert signals.caught == [number]
+  assert signal.getsignal(number) == before
   assert signal.set_wakeup_fd(-1) == -1

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from run_files import make_run
 
-from apnpql_jax.cli.sweep import check_begun, config_of, parse_sweep
+from apnpql_jax.cli.sweep import check_begun, check_plan, config_of, parse_sweep
 from apnpql_jax.errors import ConfigError, FileError
 from apnpql_jax.runs import run_folder
 from apnpql_jax.sweeps import manifest as states
@@ -58,6 +58,51 @@ def test_seeds_can_be_chosen_and_presets_are_an_axis():
 def test_a_plan_that_cannot_be_meant_is_refused(grid, seeds, words):
   with pytest.raises(ConfigError, match=words):
     make_plan(["push_plate"], grid, seeds=seeds)
+
+
+@pytest.mark.parametrize(
+  ("grid", "options", "words"),
+  [
+    ("agent.epsilon=1,2", "--agent.epsilon 3", "give agent.epsilon by --grid"),
+    ("agent.algorithm=sac,ap_sac", "--algorithm ap_npql", "give agent.algorithm by"),
+    ("algorithm=sac,ap_sac", "--agent.algorithm ap_npql", "give agent.algorithm by"),
+    ("env.obs=state,pixels", "--obs=state", "give env.obs by"),
+    ("env.backend=mjx,native", "--backend native", "give env.backend by"),
+    ("env.randomize=true", "--env.no-randomize", "give env.randomize by"),
+    ("video=true,false", "--no_video", "give video by"),
+    ("agent.n-step=1,2", "--agent.n_step 3", "give agent.n_step by"),
+    ("seed=1,2", "--seed 3", "give seed by"),
+  ],
+)
+def test_what_varies_is_not_given_for_all_runs_too(grid, options, words):
+  with pytest.raises(ConfigError, match=words):
+    make_plan(["push_plate"], [grid], options=options.split())
+  with pytest.raises(ConfigError, match=f"{words.split()[1]} twice"):
+    make_plan(["push_plate"], [grid, f"{words.split()[1]}=1"])
+
+
+def test_two_runs_that_are_the_same_are_refused():
+  with pytest.raises(ConfigError, match=r"epsilon_1-.* and .*_1\.0-.* are the same"):
+    check_plan(make_plan(["push_plate"], ["agent.epsilon=1,1.0"]))
+  check_plan(make_plan(["push_plate"], ["init_from=runs/a,runs/b"]))
+
+
+def test_a_sweep_finds_its_files_from_another_folder(tmp_path, monkeypatch):
+  monkeypatch.chdir(tmp_path)
+  (tmp_path / "task.py").touch()
+  grid = ["replay.demonstrations=mine.npz,my demos.npz"]
+  line = "--init-from runs/a:20 --task_file=./task.py --env.obs=state"
+  plan = make_plan(["push_plate"], grid, options=line.split())
+  elsewhere = make_plan(["push_plate"], ["init_from=runs/b:best"])
+  monkeypatch.chdir("/")
+  check_plan(plan)
+  found = [config_of(run.argv).replay.demonstrations for run in plan]
+  assert found == [str(tmp_path / name) for name in ("mine.npz", "my demos.npz")]
+  start = ["--init-from", f"{tmp_path}/runs/a:20", f"--task_file={tmp_path}/task.py"]
+  assert all(run.argv[1:4] == start for run in plan)
+  assert elsewhere[0].argv[1:3] == ["--init-from", f"{tmp_path}/runs/b:best"]
+  (none,) = make_plan(["push_plate"], [], options=["--replay.demonstrations", ""])
+  assert config_of(none.argv).replay.demonstrations == ""
 
 
 def test_options_that_the_sweep_does_not_have_are_those_of_train():
@@ -139,7 +184,8 @@ def test_a_preset_that_has_changed_is_noticed(tmp_path):
   run_folder.create(tmp_path / "run", config_of(begun.runs[0].argv))
   check_begun(begun)
   check_begun(planned("b.py", "total_steps=1000, checkpoint_every=7"))
-  with pytest.raises(ConfigError, match=r"total_steps.*remove it to train it again"):
+  cures = f"total_steps.* sweep --resume {tmp_path}; or .*--out, or remove the run"
+  with pytest.raises(ConfigError, match=cures):
     check_begun(planned("c.py", "total_steps=2000"))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 import errno
 import io
 import os
@@ -12,6 +13,7 @@ import textwrap
 import threading
 import time
 
+from hypothesis import given, strategies as st
 import pytest
 from rich.console import Console
 from run_files import make_run
@@ -21,7 +23,7 @@ from apnpql_jax.runs import run_folder
 from apnpql_jax.sweeps import manifest as states
 from apnpql_jax.sweeps.display import SweepDisplay
 from apnpql_jax.sweeps.following import Follower, last_line
-from apnpql_jax.sweeps.launcher import Work
+from apnpql_jax.sweeps.launcher import Job, Launcher, Work
 from apnpql_jax.sweeps.local import LocalLauncher, available_cores, shares
 from apnpql_jax.sweeps.manifest import Entry, Manifest
 from apnpql_jax.sweeps.runner import Runner
@@ -54,7 +56,11 @@ def sweep_of(folder: Path, *programs: str) -> Manifest:
 
 
 def run(
-  sweep: Manifest, *, jobs: int = 1, caught: list[int] | None = None
+  sweep: Manifest,
+  *,
+  jobs: int = 1,
+  caught: list[int] | None = None,
+  show: Callable[[], None] = lambda: None,
 ) -> list[str]:
   """Runs a sweep and returns the names of runs in the order in which they started."""
   started = []
@@ -64,7 +70,7 @@ def run(
       started.append(entry.name)
 
   caught = [] if caught is None else caught
-  Runner(sweep, LocalLauncher(jobs), report).run(caught, lambda: None)
+  Runner(sweep, LocalLauncher(jobs), report).run(caught, show)
   return started
 
 
@@ -130,14 +136,34 @@ def test_runs_at_the_same_time_have_cores_of_their_own(tmp_path, monkeypatch):
     (1, [[0, 1, 2, 3, 4]]),
     (2, [[0, 1], [2, 3, 4]]),
     (5, [[0], [1], [2], [3], [4]]),
-    (7, [[0], [0], [1], [2], [3], [4], [4]]),
+    (7, [[0], [0], [1], [2], [2], [3], [4]]),
   ],
 )
 def test_shares_are_neighbors_and_none_is_empty(count, expected):
-  found = shares(range(5), count)
+  assert shares(range(5), count) == expected
+
+
+@given(size=st.integers(1, 16), count=st.integers(1, 40))
+def test_all_items_are_shared_and_as_evenly_as_possible(size, count):
+  found = shares(range(size), count)
   assert all(found) and len(found) == count
-  if count <= 5:
-    assert found == expected
+  used = [sum(item in share for share in found) for item in range(size)]
+  assert min(used) >= max(1, count // size) and max(used) <= -(-count // size)
+
+
+def test_runs_that_share_a_gpu_do_not_reserve_more_than_its_memory(
+  tmp_path, monkeypatch
+):
+  monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
+  program = """
+    import os, time
+    time.sleep(1)
+    names = "CUDA_VISIBLE_DEVICES", "XLA_PYTHON_CLIENT_MEM_FRACTION"
+    print(*map(os.environ.get, names))
+  """
+  run(sweep_of(tmp_path, *4 * [program]), jobs=4)
+  found = [last_line(tmp_path / f"{name}.log").split() for name in "abcd"]
+  assert found == [["0", "0.450"], ["0", "0.450"], ["1", "0.450"], ["1", "0.450"]]
 
 
 WAITING = """
@@ -167,31 +193,37 @@ def test_a_signal_reaches_the_runs_and_starts_no_more(tmp_path):
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="only on Linux")
 def test_a_job_whose_time_is_over_saves_and_is_queued_again(tmp_path, monkeypatch):
+  """More often than the three times that submitit allows by itself."""
   pytest.importorskip("submitit")
   monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
   program = f"""
     import pathlib, signal, sys, time
-    path = pathlib.Path({str(tmp_path / "saved")!r})
-    if path.exists():
+    path = pathlib.Path({str(tmp_path)!r}, "saved")
+    saves = int(path.read_text()) if path.exists() else 0
+    if saves == 4:
       sys.exit(print("resumed"))
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(path.touch() or 143))
+    more = str(saves + 1)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(path.write_text(more) and 143))
     print("ready", flush=True)
     time.sleep(600)
   """
   sweep = sweep_of(tmp_path, program)
-  launcher = SlurmLauncher(tmp_path / "submitit", cluster="local")
+  settings = {"timeout_min": 10}  # So few that each end counts at once.
+  folder = tmp_path / "submitit"
+  launcher = SlurmLauncher(folder, cluster="local", settings=settings)
   log = tmp_path / "a.log"
 
   def over() -> None:
-    while not (log.exists() and log.read_text()):
-      time.sleep(0.05)
-    job = sweep.runs[0].job
-    children = Path(f"/proc/{job}/task/{job}/children").read_text().split()
-    os.kill(int(children[0]), signal.SIGUSR2)  # As submitit does before the end.
+    for number in range(1, 5):
+      while not (log.exists() and log.read_text().count("ready") == number):
+        time.sleep(0.05)
+      job = sweep.runs[0].job
+      children = Path(f"/proc/{job}/task/{job}/children").read_text().split()
+      os.kill(int(children[0]), signal.SIGUSR2)  # As submitit does before the end.
 
   threading.Thread(target=over).start()
   Runner(sweep, launcher, lambda _: None).run([], lambda: None)
-  assert log.read_text() == "ready\nresumed\n"
+  assert log.read_text() == 4 * "ready\n" + "resumed\n"
   (entry,) = states.load(tmp_path).runs
   assert (entry.state, entry.attempts, entry.code) == (states.DONE, 1, 0)
 
@@ -210,6 +242,103 @@ def test_a_signal_reaches_jobs_too(tmp_path, monkeypatch):
 
   Runner(sweep, launcher, lambda _: None).run(caught, show)
   assert [(x.state, x.code, x.line) for x in sweep.runs] == [("stopped", 143, "saved")]
+
+
+class Finding(Launcher):
+  """A launcher that finds the processes of an earlier one, as on a cluster."""
+
+  def __init__(self, jobs: int, found: Mapping[str, Job]):
+    """Finds the jobs of ``found`` by their names."""
+    self.jobs, self._found = jobs, found
+    self._local = LocalLauncher(jobs)
+
+  def start(self, work: Work) -> Job:
+    """See ``Launcher.start``."""
+    return self._local.start(work)
+
+  def find(self, name: str) -> Job | None:
+    """See ``Launcher.find``."""
+    return self._found.get(name)
+
+
+def test_jobs_of_an_earlier_process_are_taken_over_and_take_their_room(tmp_path):
+  sweep = sweep_of(tmp_path, *2 * ["import time; time.sleep(1)"], "", "")
+  earlier, events = LocalLauncher(2), []
+  for entry in sweep.runs[:2]:
+    entry.attempts, entry.job = 1, f"job of {entry.name}"
+  found = {x.job: earlier.start(sweep.work(x)) for x in sweep.runs[:2]}
+  sweep.save()
+  runner = Runner(sweep, Finding(1, found), lambda x: events.append((x.name, x.state)))
+  runner.run([], lambda: None)
+  assert events[:2] == [("a", states.RUNNING), ("b", states.RUNNING)]
+  assert sorted(events[2:4]) == [("a", states.DONE), ("b", states.DONE)]
+  each = [(name, state) for name in "cd" for state in (states.RUNNING, states.DONE)]
+  assert events[4:] == each
+  assert [(x.attempts, x.job) for x in states.load(tmp_path).runs] == 4 * [(1, "")]
+
+
+def test_a_closed_terminal_leaves_jobs_running(tmp_path, monkeypatch):
+  pytest.importorskip("submitit")
+  monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+  sweep = sweep_of(tmp_path, WAITING, "")
+  launcher = SlurmLauncher(tmp_path / "submitit", cluster="local", jobs=1)
+  caught: list[int] = []
+  log = tmp_path / "a.log"
+
+  def show() -> None:
+    if log.exists() and log.read_text():
+      caught.append(signal.SIGHUP)
+
+  Runner(sweep, launcher, lambda _: None).run(caught, show)
+  first, second = states.load(tmp_path).runs
+  assert (first.state, second.state) == (states.RUNNING, states.WAITING)
+  os.kill(int(first.job), signal.SIGTERM)  # It still runs.
+  while "saved" not in log.read_text():
+    time.sleep(0.05)
+
+
+def test_a_job_that_has_just_ended_can_be_stopped(tmp_path, monkeypatch):
+  pytest.importorskip("submitit")
+  monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+  sweep = sweep_of(tmp_path, "")
+  launcher = SlurmLauncher(tmp_path / "submitit", cluster="local")
+  job = launcher.start(sweep.work(sweep.runs[0]))
+  while (code := job.poll()) is None:
+    time.sleep(0.05)
+  job.stop()
+  assert code == 0
+
+
+SLURM = {
+  "srun": "",
+  "sbatch": 'echo "Submitted batch job 17"; echo PENDING > state',
+  "sacct": 'echo "JobID|State|NodeList"; echo "17|$(cat state)|"',
+  "scancel": 'echo "CANCELLED by 0" > state',  # codespell:ignore
+}
+"""Commands of a cluster whose queue does not move."""
+
+
+def test_a_job_that_is_canceled_in_the_queue_has_been_stopped(tmp_path, monkeypatch):
+  pytest.importorskip("submitit")
+  monkeypatch.chdir(tmp_path)
+  monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+  for name, lines in SLURM.items():
+    (tmp_path / name).write_text(f"#!/bin/sh\ncd {tmp_path}\n{lines}\n")
+    (tmp_path / name).chmod(0o755)
+  sweep = sweep_of(tmp_path, "")
+  Runner(sweep, SlurmLauncher(tmp_path / "submitit"), lambda _: None).run(
+    caught := [], lambda: caught.append(signal.SIGINT)
+  )
+  (entry,) = states.load(tmp_path).runs
+  assert (entry.state, entry.code) == (states.STOPPED, 143)
+  assert "job 17" in entry.line
+
+
+def test_a_run_that_is_stopped_as_it_starts_has_not_failed(tmp_path):
+  sweep = sweep_of(tmp_path, "import time; time.sleep(60)")
+  caught: list[int] = []
+  run(sweep, caught=caught, show=lambda: caught.append(signal.SIGINT))
+  assert (sweep.runs[0].state, sweep.runs[0].code) == (states.STOPPED, -signal.SIGTERM)
 
 
 def test_two_processes_cannot_run_one_sweep(tmp_path):
@@ -308,3 +437,5 @@ def test_a_run_that_has_begun_is_resumed_with_what_it_does_not_store(
   assert work.command()[3:] == [*resumed, "--devices", "4"]
   named = work._replace(argv=["push_plate"])
   assert named.command()[3:] == resumed[:3]
+  both = work._replace(argv=["./mine.py", "--task-file", "task.py"])
+  assert both.command()[3:] == [*resumed[:4], "task.py"]

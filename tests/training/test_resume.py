@@ -74,7 +74,7 @@ def test_a_run_killed_at_random_times_ends_like_an_undisturbed_one(tmp_path, kil
   assert process.wait(30) == 128 + signal.SIGINT
   *_, before, last = log.read_text().splitlines()
   assert "compiling" in before and last.startswith("apnpql: stopped before the first")
-  assert f"16 instants of {demos} fill 32 slots" in log.read_text()
+  assert f"32 slots from 16 instants of {demos}" in log.read_text()
 
   lost, saving = [], 0
   for _ in range(kills):

@@ -7,8 +7,10 @@ from concurrent.futures import ThreadPoolExecutor
 import dataclasses
 import inspect
 import json
+import os
 from pathlib import Path
 import shutil
+import signal
 from typing import Any
 
 import imageio.v3 as iio
@@ -222,6 +224,21 @@ def test_resume_continues_the_run(finished, monkeypatch, capsys):
   rows = (run_dir / "metrics.jsonl").read_text().splitlines()
   steps = [json.loads(row)["step"] for row in rows if "loss/q" in row]
   assert steps == [*range(8, 104, 8)]
+
+
+def test_a_signal_in_the_last_iteration_costs_no_evaluation(tmp_path, monkeypatch):
+  report = reporter.Reporter.iteration
+
+  def report_and_stop(*args: Any) -> None:
+    report(*args)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+  monkeypatch.setattr(reporter.Reporter, "iteration", report_and_stop)
+  run_dir = tmp_path / "run"
+  summary = train(changed(total_steps=testing.STEPS), run_dir, handle_signals=True)
+  assert (summary["env_steps"], summary["episodes"]) == (testing.STEPS, 4)
+  (row,) = (row for row in testing.rows(run_dir) if "eval/episodes" in row)
+  assert row["step"] == checkpoint_reader.best_step(run_dir) == testing.STEPS
 
 
 def test_resume_rejects_other_settings(finished):
