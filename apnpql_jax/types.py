@@ -20,7 +20,9 @@ Array = jax.Array
 Metrics = dict[str, jax.Array]
 
 ARM_DOF = 6  # joints of the UR5e
-ACTION_DIM = ARM_DOF + 1  # joint velocities in [-1, 1] rad/s, gripper (1 closes)
+# Joint velocities in [-1, 1] rad/s, then the gripper: 0 opens, 1 closes, both at full
+# speed. The motors clip all of them.
+ACTION_DIM = ARM_DOF + 1
 PRIMITIVES = ("object", "goal", "neutral")  # paper Sec. V-A
 NUM_PRIMITIVES = len(PRIMITIVES)
 

@@ -161,8 +161,9 @@ def test_errors_name_the_file_and_the_line(tmp_path: Path):
   scene.write_text(mjcf.replace("<geom", "<geon"))
   line = refusal(tmp_path, *collect)
   assert f"{scene} does not compile" in line and "geon" in line and "line 5" in line
+  assert refusal(tmp_path, "list", "mine.py") == line
   scene.unlink()
-  assert "mine" in refusal(tmp_path, *collect)
+  assert f"'mine' has no scene: {scene} is missing" in refusal(tmp_path, *collect)
 
 
 def test_installed_packages_bring_tasks_and_presets(tmp_path: Path):

@@ -195,18 +195,23 @@ def repeat(args: Repeat) -> Json:
 
 
 def list_names(args: List) -> Json:
-  """Returns the names that other commands accept, or a contact report of each task."""
-  for file in args.files:
-    user_files.load(file)
-  from apnpql_jax import tasks
+  """Returns the names that other commands accept, or a contact report of each task.
+
+  Builds the tasks of ``args.files``, so that what is wrong with them shows.
+  """
+  modules = [user_files.load(file) for file in args.files]
+  from apnpql_jax import devices, tasks
   from apnpql_jax.agents import table_one
 
   names = tasks.task_names()
+  if modules or args.contacts:
+    devices.start()
+  for module in modules:
+    for name in tasks.registered_by(module.__name__):
+      tasks.make_task(name)
   if args.contacts:
-    from apnpql_jax import devices
     from apnpql_jax.envs.contact_report import contact_report
 
-    devices.start()
     return {name: contact_report(tasks.make_task(name)) for name in names}
   return {
     "tasks": names,

@@ -260,7 +260,7 @@ class List(Command):
   """
 
   files: tyro.conf.Positional[tuple[Path, ...]] = ()
-  """Python files whose tasks to list as well."""
+  """Python files whose tasks to build and list as well."""
 
   contacts: Flag = False
   """Report contacts and physics speed of every scene instead; compiles for minutes."""

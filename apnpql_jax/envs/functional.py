@@ -59,7 +59,8 @@ class FunctionalEnv:
   """
 
   action_size = ACTION_DIM
-  """Joint velocities in [-1, 1] rad/s, and the gripper, which 1 closes."""
+  """Joint velocities in [-1, 1] rad/s, and the gripper, which closes where its command
+  is positive, as in Gymnasium: 0 and 1 work, and so do policies in [-1, 1]."""
 
   def __init__(self, config: EnvConfig):
     """Builds the environment; ``worlds`` of the settings has no effect.
@@ -84,6 +85,7 @@ class FunctionalEnv:
   def _step(self, state: State, action: Float[Array, "worlds 7"]) -> State:
     rows, keys, rng = self._draw(state.info["rng"])
     before = state.pipeline_state
+    action = action.at[:, -1].set(action[:, -1] > 0.0)
     arrival = self.env.advance_or_begin(before, action, rows, keys)
     worlds = truncate_faults(before, self.env.observe(arrival))
     after = _state(worlds, rng, before.faults)
@@ -116,20 +118,38 @@ def _state(worlds: EnvState, rng: PRNGKeyArray, faults: Array | int = 0) -> Stat
   )
 
 
-def _over_worlds(batched: Callable[..., State]) -> Callable[..., State]:
-  """Turns a function of [worlds, ...] into one of a world that ``vmap`` turns back."""
+def _over_worlds(function: Callable[..., State]) -> Callable[..., State]:
+  """Turns a function of [worlds, ...] into one of a world that ``vmap`` turns back.
+
+  Further axes of ``vmap`` are merged with that of worlds: C MuJoCo's call has but one.
+  """
+  batched = custom_vmap(function)
 
   @custom_vmap
   def single(*args: Any) -> State:
-    one = batched(*jax.tree.map(lambda x: x[None], args))
-    return jax.tree.map(lambda x: x[0], one)
+    result = batched(*jax.tree.map(lambda x: x[None], args))
+    return jax.tree.map(lambda x: x[0], result)
 
   @single.def_vmap
-  def rule(size: int, is_batched: Any, *args: Any) -> tuple[State, Any]:
-    def spread(x: Array, has_axis: bool) -> Array:
-      return x if has_axis else jnp.broadcast_to(x, (size, *x.shape))
+  def first(size: int, is_batched: Any, *args: Any) -> tuple[State, Any]:
+    result = batched(*_spread(size, is_batched, args))
+    return result, jax.tree.map(lambda _: True, result)
 
-    result = batched(*jax.tree.map(spread, args, tuple(is_batched)))
+  @batched.def_vmap
+  def further(size: int, is_batched: Any, *args: Any) -> tuple[State, Any]:
+    args = _spread(size, is_batched, args)
+    merged = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), args)
+    split = lambda x: x.reshape(size, -1, *x.shape[1:])  # noqa: E731
+    result = jax.tree.map(split, batched(*merged))
     return result, jax.tree.map(lambda _: True, result)
 
   return single
+
+
+def _spread(size: int, is_batched: Any, args: tuple[Any, ...]) -> tuple[Any, ...]:
+  """Returns the arguments of a rule of ``vmap``, all of them with its axis."""
+
+  def spread(x: Array, has_axis: bool) -> Array:
+    return x if has_axis else jnp.broadcast_to(x, (size, *x.shape))
+
+  return jax.tree.map(spread, args, tuple(is_batched))

@@ -91,22 +91,22 @@ class Worlds:
     """Runs one control period; a world whose episode is over starts another one."""
     before, rows = self._started(), self._rows(rng)
     self.state = self._step(before, jnp.asarray(actions), rows, self._keys(rng))
-    self.faults = np.asarray(self.state.faults > before.faults)
+    self.faults = np.array(self.state.faults > before.faults)
 
   def observation(self) -> dict[str, np.ndarray]:
-    """Returns the observations, each with a first axis of worlds."""
+    """Returns the observations, each with a first axis of worlds, for the caller."""
     observation = self._started().observation
-    return {k: np.asarray(getattr(observation, k)) for k in self.observation_space}
+    return {k: np.array(getattr(observation, k)) for k in self.observation_space}
 
   def flags(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns reward f64[worlds], terminated and truncated bool[worlds]."""
     timestep = self._started().timestep
-    reward = np.asarray(timestep.reward, np.float64)
-    return reward, np.asarray(timestep.terminated), np.asarray(timestep.truncated)
+    reward = np.array(timestep.reward, np.float64)
+    return reward, np.array(timestep.terminated), np.array(timestep.truncated)
 
   def draw(self) -> np.ndarray:
     """Returns a view of the robot in each world, u8[worlds, H, W, 3]."""
-    return np.asarray(self._view(self._started().physics))
+    return np.array(self._view(self._started().physics))
 
   def expert_action(self) -> np.ndarray:
     """Returns the actions of the task's scripted expert, f32[worlds, 7]."""

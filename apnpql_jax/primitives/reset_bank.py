@@ -46,6 +46,7 @@ SEED = 0  # of the banks that training and its evaluations use
 CHUNK = 32
 MAX_DRAWS = 20  # per row before the task is rejected for lack of usable resets
 SETTLE_PERIODS = 4  # default control periods at rest before a draw is accepted
+SETTLED_AT_ONCE = 512  # draws; an engine keeps memory for each of its worlds
 SETTLE_SPEED = 0.05  # m/s and rad/s; above float32 contact noise (0.04)
 SETTLE_SHIFT = 0.005  # m; an object that settles further away overlapped with another
 MAX_TRAVEL = 2.5  # rad; turning further, a joint would pass through another branch
@@ -198,9 +199,14 @@ def _settled(
   state = physics.initial_state(task.scene, *draw)
   substeps = round(EnvConfig.control_period_s / task.scene.model.opt.timestep)
   engine = NativePhysics(task.scene, substeps=substeps)
-  closed = state.qpos[:, task.scene.gripper_qpos] > 0.5
-  for _ in range(SETTLE_PERIODS):
-    state = engine.step(state, jnp.zeros((count, 6)), closed.astype(jnp.float32))
+  parts = []
+  for start in range(0, count, SETTLED_AT_ONCE):
+    part = jax.tree.map(lambda x: x[start : start + SETTLED_AT_ONCE], state)  # noqa: B023
+    closed = (part.qpos[:, task.scene.gripper_qpos] > 0.5).astype(jnp.float32)
+    for _ in range(SETTLE_PERIODS):
+      part = engine.step(part, jnp.zeros((len(closed), 6)), closed)
+    parts.append(part)
+  state = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
   restless = np.abs(np.asarray(state.qvel)).max(-1) > SETTLE_SPEED
   model = task.scene.model
   for address in model.jnt_qposadr[free_joints(model)]:
@@ -253,10 +259,14 @@ def _file_name(task: Task, rows: int, seed: int) -> str:
 
 
 def _source(task: Task) -> str:
-  """Returns a hash of the files of the task's classes and of those shared by tasks."""
+  """Returns a hash of the files of the task's classes and of those shared by tasks.
+
+  A file of the user's counts with those next to it, from which it may import ranges.
+  """
+  package = pathlib.Path(tasks.__file__).parent
   shared = [
     path
-    for path in sorted(pathlib.Path(tasks.__file__).parent.glob("*.py"))
+    for path in sorted(package.glob("*.py"))
     if "\n@register_task\n" not in path.read_text(encoding="utf-8")
   ]
   own = [
@@ -264,6 +274,10 @@ def _source(task: Task) -> str:
     for one in type(task).__mro__
     if one.__module__ not in sys.stdlib_module_names
   ]
-  files = dict.fromkeys([path for path in own if path not in shared] + shared)
+  folders = {path.parent: None for path in own if package not in path.parents}
+  near = [path for folder in folders for path in sorted(folder.glob("*.py"))]
+  near = filter(pathlib.Path.is_file, near)  # An editor's lock is a dangling link.
+  own = [path for path in own if path not in shared]
+  files = dict.fromkeys([*own, *near, *shared])
   contents = (path.read_bytes() for path in files)
   return hashlib.sha256(b"".join(contents)).hexdigest()

@@ -53,7 +53,10 @@ def make_randomize(config: RandomizationConfig, scene: Scene) -> Randomize:
     if config.size or config.shape or config.mass:
       objects.derive(world)
     if config.friction:
-      world["pair_friction"] *= draw.factor("friction")
+      factor = draw.factor("friction")
+      world["pair_friction"] *= factor
+      if (scene.model.geom_contype[:, None] & scene.model.geom_conaffinity).any():
+        world["geom_friction"] *= factor  # Of contacts that no pair lists.
     command = _control(draw, world, scene, qpos)
     return state.replace(qpos=qpos, fields=dict(world), command=command)
 

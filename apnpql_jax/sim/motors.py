@@ -41,7 +41,8 @@ def gripper_torque(
 
   C MuJoCo and MJX integrate the saturated force of a MuJoCo velocity actuator
   differently, so this is an explicit servo: from the finger's angle (rad, 0 = open) and
-  velocity (rad/s) to N m, positive closes. ``speed`` is that of the pad gap, m/s.
+  velocity (rad/s) to N m, positive closes. A ``close`` of 1 closes, 0 opens; others are
+  clipped to between them. ``speed`` is that of the pad gap, m/s.
   """
   desired = finger_rate(angle, close, xp, speed=speed)
   return (GRIPPER_GAIN * (desired - velocity)).clip(-GRIPPER_TORQUE, GRIPPER_TORQUE)
@@ -53,4 +54,4 @@ def finger_rate(angle: Any, close: Any, xp: Any, *, speed: Any = GRIPPER_SPEED) 
   The arguments are those of ``gripper_torque``.
   """
   slope = 2 * FINGER_LENGTH * xp.sin(angle.clip(0.0, 1.1) + FINGER_ANGLE)
-  return (2 * close - 1) * speed / slope
+  return (2 * xp.clip(close, 0.0, 1.0) - 1) * speed / slope

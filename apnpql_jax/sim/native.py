@@ -39,6 +39,7 @@ class NativePhysics:
     self._substeps = substeps
     self._torque_limit = scene.model.actuator_ctrlrange[:6, 1].copy()
     self._mass_index = _mass_index(scene.model, scene.arm_dof)
+    self._batch = functools.lru_cache(maxsize=4)(self._new_batch)
     self._lock = threading.Lock()
 
   def step(self, state: PhysicsState, velocity: Array, close: Array) -> PhysicsState:
@@ -59,8 +60,9 @@ class NativePhysics:
     moved = host_call.call(target, shapes, *arrays.values(), velocity, close)
     return state.replace(**dict(zip(STATE_FIELDS, moved, strict=True)), **after)
 
-  @functools.lru_cache(maxsize=4)  # noqa: B019 - lives as long as the engine
-  def _batch(self, worlds: int) -> mujoco_batch.Batch:
+  def _new_batch(self, worlds: int, names: tuple[str, ...]) -> mujoco_batch.Batch:
+    """Returns worlds of the scene; those of other ``names`` would keep their fields."""
+    del names
     return mujoco_batch.Batch(self.scene.model, nsim=worlds, persistent=True)
 
   def _step_host(self, names: tuple[str, ...], *arrays: np.ndarray) -> list[np.ndarray]:
@@ -68,7 +70,7 @@ class NativePhysics:
     *loaded, velocity, close = arrays
     command = np.concatenate([velocity, close[:, None]], axis=-1)
     with self._lock:
-      batch, control = self._batch(len(command)), {}
+      batch, control = self._batch(len(command), names), {}
       for name, value in zip(names, loaded, strict=True):
         if name in _CONTROL:
           control[name] = value

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import functools
+import inspect
 from typing import Any
 
 import jax
@@ -28,10 +29,13 @@ def make_task(name: str) -> Task:
   """Builds the task ``name`` and checks it.
 
   Raises:
-    ConfigError: No task has this name, two files want it, a free body of its scene
-      would fall out of the world, or a method does not follow the protocol.
+    ConfigError: No task has this name, two files want it, its class is not in a file, a
+      free body of its scene would fall out of the world, or a method does not follow
+      the protocol.
   """
-  task = _call(name, "__init__", task_class(name))
+  kind = task_class(name)
+  _check_file(name, kind)
+  task = _call(name, "__init__", kind)
   scene = getattr(task, "scene", None)
   if not isinstance(scene, Scene):
     raise ConfigError(f"task {name!r} has no Scene in its attribute scene")
@@ -47,15 +51,30 @@ def make_task(name: str) -> Task:
   return task
 
 
+def _check_file(name: str, kind: type[Task]) -> None:
+  """Checks that a class is in a file, next to which its scene may be."""
+  try:
+    inspect.getfile(kind)
+  except (OSError, TypeError):
+    raise ConfigError(
+      f"the class of task {name!r} is not in a file, but in a notebook or at a prompt: "
+      "write it to a Python file and load that, as load_preset does with its path"
+    ) from None
+
+
 def _check_resets(task: Task) -> tuple[PhysicsState, Kinematics]:
   """Checks drawn resets; returns the shapes of their states and poses."""
   scene, model, n = task.scene, task.scene.model, _WORLDS
   rng = np.random.default_rng(0)
   draw = _call(task.name, "sample_resets", _method(task, "sample_resets"), rng, n)
+  if not isinstance(draw, ResetDraw):
+    returned = type(draw).__name__
+    raise ConfigError(
+      f"task {task.name!r}: sample_resets returns {returned}, not ResetDraw"
+    )
   mocap = _floats(n, model.nmocap, 3), _floats(n, model.nmocap, 4)
   variants = jax.ShapeDtypeStruct((n,), np.int32)
   _compare(task, "sample_resets", draw, (_floats(n, model.nq), *mocap, variants))
-  draw = ResetDraw(*draw)
   quats = [draw.qpos[:, i + 3 : i + 7] for i in model.jnt_qposadr[free_joints(model)]]
   quats += list(np.moveaxis(draw.mocap_quat, 1, 0))
   lengths = [np.linalg.norm(quat, axis=-1) for quat in quats]

@@ -7,6 +7,7 @@ import dataclasses
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.sim.kinematics import Kinematics
 from apnpql_jax.sim.motors import FINGER_ANGLE, FINGER_LENGTH
 from apnpql_jax.sim.physics import PhysicsState
@@ -31,7 +32,11 @@ LEVER = 0.05  # m/rad; offset that a twist beyond half of the allowed one counts
 
 @dataclasses.dataclass
 class Pinch:
-  """A grip between the pads on something of known width, by a vertical tool."""
+  """A grip between the pads on something of known width, by a vertical tool.
+
+  Raises:
+    ConfigError: Something so narrow or so wide cannot be told from closed or open pads.
+  """
 
   scene: Scene
   neutral_mat: Float[Array, "3 3"]  # the tool's rotation at heading zero
@@ -45,6 +50,15 @@ class Pinch:
   depth: float = dataclasses.field(init=False)  # m, tool site back to the aimed point
 
   def __post_init__(self):
+    model = self.scene.model
+    joint = model.jnt_qposadr.tolist().index(self.scene.gripper_qpos)
+    widest, narrowest = (float(pad_gap(x)) for x in model.jnt_range[joint])
+    low, high = narrowest + TOLERANCE, widest - CLEARANCE
+    if not low < self.width < high:
+      raise ConfigError(
+        f"{self.scene.name}.xml: the hand cannot grip what is {1e3 * self.width:g} mm "
+        f"wide, only what is {1e3 * low:.1f} to {1e3 * high:.1f} mm wide"
+      )
     self.depth = float(pinch_height(self.width)) - self.above
 
   def point(self, kinematics: Kinematics) -> Point:
@@ -147,6 +161,11 @@ def is_gripping(scene: Scene, state: PhysicsState, width: Array | float) -> Mask
 def finger_angle(gap: Array | float) -> Array:
   """Returns the angle (rad) of the driven finger for a gap (m) between the pads."""
   return jnp.arccos((gap / 2 - 0.0041) / FINGER_LENGTH) - FINGER_ANGLE
+
+
+def pad_gap(angle: Array | float) -> Array:
+  """Returns the gap (m) between the pads, the inverse of ``finger_angle``."""
+  return 2 * (0.0041 + FINGER_LENGTH * jnp.cos(angle + FINGER_ANGLE))
 
 
 def pinch_height(gap: Array | float) -> Array:

@@ -28,7 +28,7 @@ from apnpql_jax.types import Array
 
 WORKSPACE = ((0.40, 0.52), (-0.22, 0.22))  # m; x and y within a vertical tool's reach
 HOLDER_YAW, BOX_YAW = 0.5, 0.3  # rad; largest yaw of each
-MIN_DISTANCE = 0.26  # m; half the box's diagonal (154 mm), the plate and fingers
+MIN_DISTANCE = 0.26  # m; the box's outer corner (195 mm) and half the plate (65 mm)
 THICKNESS = 0.012  # m; of the plate
 RADIUS = 0.0647  # m; from the plate's center to the middle of a side of its octagon
 GRASP_INSET = 0.013  # m from the edge to the center of the pads, which are 20 mm long

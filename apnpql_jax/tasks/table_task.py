@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from apnpql_jax.config.files import mjcf_path
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.sim import arm
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.sim.scene import load_scene
@@ -65,9 +66,14 @@ class TableTask:
     self._neutral_pos, self._neutral_mat, _ = arm.forward(chain, neutral)
 
   def _mjcf(self) -> Path:
-    """Returns the path of the scene."""
+    """Returns the path of the scene, or raises ``ConfigError`` if there is none."""
     own = Path(inspect.getfile(type(self))).with_name(f"{self.name}.xml")
-    return own if own.is_file() else mjcf_path(self.name)
+    if own.is_file():
+      return own
+    try:
+      return mjcf_path(self.name)
+    except ConfigError:
+      raise ConfigError(f"task {self.name!r} has no scene: {own} is missing") from None
 
   def draw_qpos(self, rng: np.random.Generator, count: int) -> np.ndarray:
     """Draws neutral states with noise on the arm, f64[count, nq]."""

@@ -128,6 +128,11 @@ def task_names() -> list[str]:
   return sorted(_REGISTRY)
 
 
+def registered_by(module: str) -> list[str]:
+  """Returns the names of the tasks whose classes are in a module, sorted."""
+  return sorted(n for n, task in _REGISTRY.items() if task.__module__ == module)
+
+
 def task_class(name: str) -> type[Task]:
   """Returns the class of the task ``name``.
 

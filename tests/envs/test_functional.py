@@ -54,6 +54,38 @@ def test_vmap_equals_one_world_after_the_other(env):
     np.testing.assert_array_equal(alone.done, many.done[world])
 
 
+def test_vmap_of_vmap_equals_one_of_all_worlds(env):
+  keys = jax.random.split(jax.random.key(3), 6)
+  actions = jax.random.uniform(jax.random.key(4), (6, 7), minval=-1)
+
+  def played(key: jax.Array, action: jax.Array) -> State:
+    return env.step(env.reset(key), action)
+
+  flat = jax.jit(jax.vmap(played))(keys, actions)
+  nested = jax.jit(jax.vmap(jax.vmap(played)))(
+    keys.reshape(2, 3), actions.reshape(2, 3, 7)
+  )
+  for name, value in flat.obs.items():
+    assert nested.obs[name].shape == (2, 3, *value.shape[1:])
+    found = nested.obs[name].reshape(value.shape)
+    np.testing.assert_allclose(found, value, atol=2e-5)
+  same_keys = jax.random.key_data(nested.info["rng"]).reshape(6, -1)
+  np.testing.assert_array_equal(same_keys, jax.random.key_data(flat.info["rng"]))
+
+
+def test_the_gripper_closes_where_its_command_is_positive(env):
+  """So that actions in [-1, 1], as those of Brax's policies, mean the same."""
+  commands = jnp.array([-1.0, 0.0, 0.3, 1.0])
+  state = jax.jit(jax.vmap(env.reset))(jnp.tile(jax.random.key(5), 4))
+  for _ in range(2):
+    actions = jnp.zeros((4, 7)).at[:, -1].set(commands)
+    state = jax.jit(jax.vmap(env.step))(state, actions)
+  joints = np.asarray(state.pipeline_state.physics.qpos)
+  np.testing.assert_allclose(joints[::2], joints[1::2], atol=1e-5)
+  finger = env.env.task.scene.gripper_qpos
+  assert abs(joints[2, finger] - joints[1, finger]) > 0.05
+
+
 def test_a_step_after_the_end_begins_a_random_episode(env):
   keys = jax.random.split(jax.random.key(2), WORLDS)
   still = jnp.zeros((WORLDS, PERIODS, 7))

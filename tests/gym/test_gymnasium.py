@@ -134,6 +134,21 @@ def test_episodes_end_as_in_the_vector_environment_of_gymnasium(mode):
         envs.reset(options={"reset_mask": done.copy()})
 
 
+def test_what_a_step_returns_belongs_to_the_caller():
+  """Who may write into it, as into what other environments return."""
+  one, mode = make(**SHORT), AutoresetMode.SAME_STEP
+  many = gymnasium.make_vec(
+    NAMES["push_plate"], num_envs=2, autoreset_mode=mode, **SHORT
+  )
+  returned = [one.reset(seed=0)[0], many.reset(seed=0)[0], one.step(np.zeros(7))[0]]
+  for _ in range(3):
+    observation, *flags, info = many.step(np.zeros((2, 7)))
+    returned += [observation, flags]
+  returned += [info["final_obs"].tolist(), info["final_info"], info["fault"]]
+  for array in jax.tree.leaves(returned):
+    array[...] = 0  # Would fail for a view of an array of JAX.
+
+
 @pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
 def test_success_ends_episodes_as_in_the_vector_environment_of_gymnasium(mode):
   """The expert plays the same worlds in both until an episode is over."""

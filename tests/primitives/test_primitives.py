@@ -129,6 +129,19 @@ def test_draws_settle_for_four_control_periods(timestep):
   np.testing.assert_allclose(state.time, physics.START_TIME + 0.6, rtol=1e-5)
 
 
+def test_draws_settle_alike_in_parts(task, monkeypatch):
+  def settled():
+    rng, report = np.random.default_rng(0), reset_bank.BankReport()
+    return jax.tree.leaves(reset_bank._settled(task, rng, 10, report)), report.drawn
+
+  whole, drawn = settled()
+  monkeypatch.setattr(reset_bank, "SETTLED_AT_ONCE", 4)
+  parts, drawn_in_parts = settled()
+  assert drawn == drawn_in_parts == 10
+  for one, other in zip(whole, parts, strict=True):
+    np.testing.assert_array_equal(one, other)
+
+
 def test_a_base_class_in_another_file_is_part_of_the_banks_name(tmp_path, monkeypatch):
   monkeypatch.syspath_prepend(tmp_path)
   base = tmp_path / "bases.py"
@@ -142,6 +155,22 @@ def test_a_base_class_in_another_file_is_part_of_the_banks_name(tmp_path, monkey
   name = reset_bank._file_name(mine, 16, 0)
   assert name == reset_bank._file_name(mine, 16, 0)
   base.write_text(base.read_text() + "# Another draw.\n")
+  assert name != reset_bank._file_name(mine, 16, 0)
+
+
+def test_a_file_next_to_the_users_is_part_of_the_banks_name(tmp_path, monkeypatch):
+  monkeypatch.syspath_prepend(tmp_path)
+  ranges = tmp_path / "ranges.py"
+  ranges.write_text("LOW, HIGH = 0.1, 0.2\n")
+  (tmp_path / "ranged.py").write_text(
+    "import ranges\nfrom apnpql_jax.tasks.stack_box import StackBox\n"
+    "class Ranged(StackBox): pass\n"
+  )
+  (tmp_path / ".#ranged.py").symlink_to("user@host.1")  # Emacs edits the file.
+  mine = importlib.import_module("ranged").Ranged()
+  name = reset_bank._file_name(mine, 16, 0)
+  assert name == reset_bank._file_name(mine, 16, 0)
+  ranges.write_text("LOW, HIGH = 0.1, 0.3\n")
   assert name != reset_bank._file_name(mine, 16, 0)
 
 

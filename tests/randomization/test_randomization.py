@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from apnpql_jax.cli.new_task import NewTask, new_task
 from apnpql_jax.config.files import mjcf_path
 from apnpql_jax.config.ranges import RandomizationConfig
 from apnpql_jax.config.schema import EnvConfig
@@ -166,6 +167,34 @@ def test_a_camera_on_a_stand_shifts_as_one_in_the_world():
     randomized(scene, config).fields["cam_pos"][:, scene.id("camera", "side")]
   )
   assert 0.5 * ALL.camera_shift < shift.max() <= 1.001 * ALL.camera_shift
+
+
+def test_one_factor_changes_the_friction_of_all_contacts():
+  """Also of those by masks: here the plate lies on the table and on a shelf in it."""
+
+  def add(spec: mujoco.MjSpec) -> None:
+    shelf = spec.worldbody.add_geom(name="shelf", type=mujoco.mjtGeom.mjGEOM_BOX)
+    shelf.size, shelf.pos, shelf.conaffinity = [0.1] * 3, [0.5, -0.2, -0.0999], 1
+    spec.geom("plate_base").contype = 1
+
+  scene = load_scene(mjcf_path("push_plate"), variants=[add])
+  state = randomized(scene, dataclasses.replace(NONE, friction=ALL.friction))
+  factors = []
+  for world in range(WORLDS):
+    frictions = []
+    for fields in ({}, state.fields):
+      model = copy.copy(scene.model)
+      for name, value in fields.items():
+        getattr(model, name)[:] = value[world]
+      data = mujoco.MjData(model)
+      data.qpos[:] = scene.keyframe("neutral")
+      mujoco.mj_forward(model, data)
+      frictions.append(data.contact.friction.copy())
+    touching = {scene.model.geom(geom).name for geom in data.contact.geom.flat}
+    assert touching == {"plate_base", "table", "shelf"}
+    factors.append(np.divide(*frictions[::-1]))
+    np.testing.assert_allclose(factors[-1], factors[-1][0, 0], rtol=1e-5)
+  assert np.ptp([factor[0, 0] for factor in factors]) > 0.5 * ALL.friction
 
 
 def test_inertia_is_proportional_to_mass(task):
@@ -352,6 +381,36 @@ def _episodes(env: Env, *, seed: int = 0) -> EnvState:
   for key in jax.random.split(jax.random.key(seed), 8):
     states.append(env.step(states[-1], env.expert_action(states[-1]), key))
   return jax.tree.map(lambda *x: np.stack(x), *states)
+
+
+def test_a_scene_without_free_bodies_is_randomized(tmp_path):
+  """Such as the guide's, in which a ball hangs in the air."""
+  new_task(NewTask(name="touch_ball", folder=tmp_path))
+  scene = load_scene(tmp_path / "touch_ball.xml")
+  assert not free_bodies(scene.model).any()
+  state = randomized(scene, ALL)
+  changed = set().union(*CHANGES.values()) - {"pair_friction"}  # It has no pairs.
+  still = SIZES | CHANGES["mass"]
+  for name in changed - still:
+    assert len(np.unique(np.asarray(state.fields[name]), axis=0)) > 1, name
+  for name in still:
+    expected = np.broadcast_to(getattr(scene.model, name), state.fields[name].shape)
+    np.testing.assert_allclose(state.fields[name], expected, rtol=1e-6)
+  step = engines.make_physics("native", scene, substeps=30).step
+  state = state.replace(mocap_quat=state.mocap_quat.at[..., 0].set(1.0))
+  after = step(state, jnp.full((WORLDS, 6), 0.2), jnp.ones(WORLDS))
+  assert all(np.isfinite(x).all() for x in jax.tree.leaves(after))
+  assert len(np.unique(np.asarray(after.qvel[:, :6]), axis=0)) == WORLDS
+
+
+def test_a_plain_world_is_plain_after_randomized_ones(task, drawn):
+  """Although C MuJoCo keeps the fields of the worlds that it has stepped."""
+  step = engines.make_physics("native", task.scene, substeps=30).step
+  moving, closed = jnp.full((WORLDS, 6), 0.5), jnp.ones(WORLDS)
+  plain = _states(task)
+  before = step(plain, moving, closed)
+  assert _bits(step(drawn, moving, closed).qvel) != _bits(before.qvel)
+  assert _bits(step(plain, moving, closed)) == _bits(before)
 
 
 def test_zero_ranges_equal_no_randomization(plain_env):

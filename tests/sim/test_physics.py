@@ -164,6 +164,21 @@ def test_gripper_closes_at_its_speed(engines, resets, task, name: str):
   np.testing.assert_allclose(angles, angles[:, :1] * np.ones(4), atol=0.02)
 
 
+@pytest.mark.parametrize("name", ENGINES)
+def test_no_command_moves_the_gripper_faster_than_0_or_1(engines, resets, task, name):
+  """Such as those of a policy whose actions are all in [-1, 1]."""
+  fingers = slice(task.scene.gripper_qpos, task.scene.gripper_qpos + 4)
+  state = resets.replace(qpos=resets.qpos.at[:, fingers].set(0.5))
+  worlds = len(resets.qpos)
+  for command, limit in ((-1.0, 0.0), (2.0, 1.0)):
+    beyond, within = (
+      engines[name](state, jnp.zeros((worlds, 6)), jnp.full(worlds, close))
+      for close in (command, limit)
+    )
+    np.testing.assert_array_equal(beyond.qpos, within.qpos)
+    assert (np.abs(within.qpos - state.qpos)[:, fingers] > 0.05).all()
+
+
 def test_kinematics_agree_with_mujoco(task, resets):
   """All poses equal those of C MuJoCo."""
   scene = task.scene

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from apnpql_jax.config.files import mjcf_path
+from apnpql_jax.errors import ConfigError
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.tasks import make_task
@@ -158,6 +160,26 @@ def test_twist_is_the_hands_heading_less_the_objects(
   # At heading zero the hand closes along the world's x axis.
   closing = kinematics.site_xmat[:, scene.tool_site, :, 1]
   np.testing.assert_allclose(np.abs(closing[:, 0]), np.abs(np.cos(wrist)), atol=1e-3)
+
+
+@pytest.mark.parametrize("width", [0.005, 0.09])
+def test_a_width_that_the_hand_cannot_grip_is_refused(pinch, width):
+  message = f"{1e3 * width:g} mm wide, only what is 6.2 to 86.9 mm"
+  with pytest.raises(ConfigError, match=message):
+    dataclasses.replace(pinch, width=width)
+
+
+@pytest.mark.parametrize("width", [0.0064, 0.05, 0.0867])
+def test_a_width_that_the_hand_can_grip_differs_from_open_and_closed_pads(
+  scene, resets, pinch, width
+):
+  qpos = np.tile(scene.keyframe("neutral"), (2, 1))
+  low, high = scene.model.joint("finger_r1").range
+  qpos[:, scene.gripper_qpos] = low, high
+  state = resets.replace(qpos=jnp.asarray(qpos, jnp.float32))
+  hand = dataclasses.replace(pinch, width=width)
+  np.testing.assert_array_equal(hand.is_open(state), [True, False])
+  np.testing.assert_array_equal(is_gripping(scene, state, hand.width), [False, False])
 
 
 def test_the_hand_is_open_when_the_pads_are_clear(scene, resets, pinch):

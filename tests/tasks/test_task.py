@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import sys
 from typing import Any
 
 import jax.numpy as jnp
@@ -71,6 +72,11 @@ WRONG: list[tuple[str, Any, str]] = [
     lambda s, *x: (*PushPlate.tool_targets(s, *x)[:2], jnp.ones((3, 5))),
     "float[3, 5]) .* float[5, 3])",
   ),
+  (
+    "sample_resets",
+    lambda s, *x: tuple(PushPlate.sample_resets(s, *x)),
+    "returns tuple, not ResetDraw",
+  ),
   ("sample_resets", _draw(qpos=lambda x: x[:, :10]), "(float[5, 10], .* (float[5, 17]"),
   ("sample_resets", _draw(variant=lambda x: x * 1.0), "float[5]) .* int[5])"),
   ("sample_resets", _draw(variant=lambda x: x + 1), "variant that is not from 0 to 0"),
@@ -110,3 +116,13 @@ def test_a_task_that_cannot_be_built_is_named_in_one_line(monkeypatch):
   register_task(wrong)
   with pytest.raises(ConfigError, match="task 'wrong': __init__ fails with KeyError"):
     make_task("wrong")
+
+
+def test_a_task_that_is_not_in_a_file_is_refused_with_a_cure(monkeypatch):
+  """As in a notebook, whose ``__main__`` has no file."""
+  monkeypatch.setattr(task, "_REGISTRY", dict(task._REGISTRY))
+  monkeypatch.delattr(sys.modules["__main__"], "__file__")
+  typed: Any = type("Typed", (PushPlate,), {"name": "typed", "__module__": "__main__"})
+  register_task(typed)
+  with pytest.raises(ConfigError, match="'typed' is not in a file.* load_preset"):
+    make_task("typed")
