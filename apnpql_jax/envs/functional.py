@@ -139,8 +139,7 @@ def _over_worlds(function: Callable[..., State]) -> Callable[..., State]:
   def further(size: int, is_batched: Any, *args: Any) -> tuple[State, Any]:
     args = _spread(size, is_batched, args)
     merged = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), args)
-    split = lambda x: x.reshape(size, -1, *x.shape[1:])  # noqa: E731
-    result = jax.tree.map(split, batched(*merged))
+    result = jax.tree.map(lambda x: x.reshape(size, -1, *x.shape[1:]), batched(*merged))
     return result, jax.tree.map(lambda _: True, result)
 
   return single
