@@ -121,7 +121,7 @@ def test_a_task_that_cannot_be_built_is_named_in_one_line(monkeypatch):
 def test_a_task_that_is_not_in_a_file_is_refused_with_a_cure(monkeypatch):
   """As in a notebook, whose ``__main__`` has no file."""
   monkeypatch.setattr(task, "_REGISTRY", dict(task._REGISTRY))
-  monkeypatch.delattr(sys.modules["__main__"], "__file__")
+  monkeypatch.delattr(sys.modules["__main__"], "__file__", raising=False)
   typed: Any = type("Typed", (PushPlate,), {"name": "typed", "__module__": "__main__"})
   register_task(typed)
   with pytest.raises(ConfigError, match="'typed' is not in a file.* load_preset"):
