@@ -27,7 +27,8 @@ ROWS = {
   ),
   "ap_sac": Row(
     "ap_sac",
-    "--agent.policy-initial-std 0.05 --agent.epsilon 50 --agent.min-alpha 0.001",
+    "--agent.policy-initial-std 0.05 --agent.min-alpha 0.0034 "
+    "--agent.learning-rate-e 0.00092 --agent.epsilon 35 --agent.policy-max-std 0.5",
   ),
   "sac": Row(
     "sac",
