@@ -22,16 +22,16 @@ _MAX_ABSOLUTE = {
   "camera_turn": 0.3,
   "table_height": 0.1,
   "table_tilt": 0.1,
-  "size": 0.07,
-  "shape": 0.09,
+  "size": 0.1,
+  "shape": 0.1,
   "damping": 2.0,
   "delay_s": 1.0,
 }
 """Upper limits in the units of the settings."""
 
-_MAX_SIZE_AND_SHAPE = 0.09
-"""Upper limit of the sum of both. A box of stack_box that is 8 % too wide or too narrow
-does not count as held, and two that are 10 % too high or too low not as stacked."""
+_MAX_SIZE, _MAX_SIZE_AND_SHAPE = 0.07, 0.09
+"""Upper limits in new runs. A box of stack_box that is 8 % too wide or too narrow does
+not count as held, and two that are 10 % too high or too low not as stacked."""
 
 WRIST_SHARE = 0.1
 """Shift of the wrist camera, as a share of that of the global camera."""
@@ -106,16 +106,25 @@ def validate_ranges(ranges: RandomizationConfig, prefix: str) -> None:
   """Checks that every range is within its limits.
 
   Raises:
-    ConfigError: A range is negative or too large, or size and shape together are; the
-      message prepends ``prefix`` to its name.
+    ConfigError: A range is negative or too large; the message prepends ``prefix`` to
+      its name.
   """
   for name, value in codec.flatten(ranges):
     limit = _MAX_ABSOLUTE.get(name, _MAX_RELATIVE)
     if not 0.0 <= value <= limit:
       raise ConfigError(f"{prefix}{name}={value} must be within [0, {limit}]")
-  both = ranges.size + ranges.shape
-  if round(both, 6) > _MAX_SIZE_AND_SHAPE:
+
+
+def check_sizes(ranges: RandomizationConfig) -> None:
+  """Checks that all tasks work with the objects of a new run; older runs still load.
+
+  Raises:
+    ConfigError: Their range of sizes is too large, or together with that of shapes.
+  """
+  both = round(ranges.size + ranges.shape, 6)
+  if ranges.size > _MAX_SIZE or both > _MAX_SIZE_AND_SHAPE:
+    name = "env.randomization."
     raise ConfigError(
-      f"{prefix}size={ranges.size} and {prefix}shape={ranges.shape} must be at most "
-      f"{_MAX_SIZE_AND_SHAPE} together"
+      f"{name}size={ranges.size} must be at most {_MAX_SIZE}, and with "
+      f"{name}shape={ranges.shape} at most {_MAX_SIZE_AND_SHAPE}"
     )

@@ -21,6 +21,7 @@ from apnpql_jax.agents import table_one
 from apnpql_jax.agents.learner import Agent, make_agent
 from apnpql_jax.config import codec
 from apnpql_jax.config.checks import PROCESS_BYTES
+from apnpql_jax.config.ranges import check_sizes
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.console import print_line
 from apnpql_jax.data import demonstrations, replay
@@ -159,6 +160,7 @@ def _check(
   )
   if not resume:
     table_one.check_effects(config)
+    check_sizes(config.env.randomization)
   check_sinks(config.sinks)
   if handle_signals and threading.current_thread() is not threading.main_thread():
     raise ConfigError("handle_signals=True works in the main thread only")

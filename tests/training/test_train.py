@@ -19,6 +19,11 @@ import pytest
 
 from apnpql_jax import testing
 from apnpql_jax.cli.options import Evaluate
+from apnpql_jax.config.ranges import (
+  RandomizationConfig,
+  check_sizes,
+  validate_ranges,
+)
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.envs.env import Env
 from apnpql_jax.errors import ConfigError, FileError, UserError
@@ -249,3 +254,24 @@ def test_resume_rejects_other_settings(finished):
   )
   with pytest.raises(UserError, match=r"agent\.gamma 0\.99 -> 0\.9"):
     train(other, run_dir, resume=True)
+
+
+@pytest.mark.parametrize(
+  ("sizes", "fits"),
+  [
+    ({"size": 0.07, "shape": 0.02}, True),
+    ({"size": 0.0, "shape": 0.09}, True),
+    ({"size": 0.08, "shape": 0.0}, False),
+    ({"size": 0.06, "shape": 0.04}, False),
+  ],
+)
+def test_a_new_run_refuses_sizes_at_which_stack_box_fails(sizes, fits: bool, tmp_path):
+  ranges = RandomizationConfig(**sizes)
+  validate_ranges(ranges, "")  # Older runs with them can still be used.
+  if fits:
+    check_sizes(ranges)
+    return
+  env = dataclasses.replace(testing.TINY.env, randomization=ranges)
+  with pytest.raises(ConfigError, match=r"size=.* at most 0\.07, .* at most 0\.09"):
+    train(dataclasses.replace(testing.TINY, env=env), tmp_path / "run")
+  assert not (tmp_path / "run").exists()
