@@ -6,12 +6,12 @@ from collections.abc import Sequence
 import contextlib
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar
 
 import tyro
 
 from apnpql_jax.cli import commands
-from apnpql_jax.cli.options import Command, Count, File, Train, parse
+from apnpql_jax.cli.options import Command, Count, File, Train, default_hint, parse
 from apnpql_jax.config import files, user_files
 from apnpql_jax.config.checks import validate
 from apnpql_jax.config.schema import TrainConfig
@@ -20,6 +20,7 @@ from apnpql_jax.reports.groups import differences
 from apnpql_jax.runs import run_folder
 from apnpql_jax.runs.sinks import check_sinks
 from apnpql_jax.sweeps import manifest as states
+from apnpql_jax.sweeps.launcher import Launch, Launcher, LauncherName
 from apnpql_jax.sweeps.manifest import Manifest
 from apnpql_jax.sweeps.plan import Planned, make_plan
 
@@ -59,9 +60,10 @@ class Sweep(Command):
   """Folder of the sweep; runs are added to a sweep that it holds."""
 
   resume: File = None
-  """Folder of a sweep to continue."""
+  """Folder of a sweep to continue, as it was started: with its launcher, settings of
+  jobs and number of jobs, unless you give others."""
 
-  launcher: Literal["local", "slurm", "slurm-local"] = "local"
+  launcher: Annotated[LauncherName | None, default_hint("(default: local)")] = None
   """Where runs are started: on this machine, on a Slurm cluster, or on this machine as
   if it were a cluster. The latter two need the extra `sweep`."""
 
@@ -95,7 +97,8 @@ def sweep(args: Sweep) -> dict[str, Any]:
     raise ConfigError(f"--jobs {args.jobs} must be at least 1")
   with contextlib.ExitStack() as stack:
     manifest = _open(args, stack)
-    training.train(manifest, _launcher(args, manifest))
+    manifest.launch = launch_of(args, manifest.launch)
+    training.train(manifest, _launcher(manifest))
   folder = str(training.shown(manifest.folder))
   runs = {entry.name: entry.state for entry in manifest.runs}
   return {"sweep": folder, "runs": runs if args.json else len(runs)}
@@ -126,7 +129,9 @@ def _open(args: Sweep, stack: contextlib.ExitStack) -> Manifest:
   """Returns the sweep to continue, or a new one."""
   if args.resume is not None:
     if args.presets or args.grid or args.train or args.out or args.seeds != 1:
-      raise ConfigError("--resume names the sweep itself; give only --jobs, --launcher")
+      raise ConfigError(
+        "--resume names the sweep itself; give only --jobs, --launcher, --slurm"
+      )
     return states.load(args.resume)
   if not args.presets:
     names = ", ".join(files.preset_names())
@@ -188,18 +193,35 @@ def _checked(run: Planned) -> Train:
   return options
 
 
-def _launcher(args: Sweep, manifest: Manifest) -> Any:
-  """Returns the launcher that was asked for."""
-  from apnpql_jax.sweeps.local import LocalLauncher
-  from apnpql_jax.sweeps.slurm import ALL_AT_ONCE, SlurmLauncher, parse_settings
+def launch_of(args: Sweep, stored: Launch) -> Launch:
+  """Returns how to start runs: as the options say, else as the sweep stores it.
 
-  if args.launcher == "local":
-    if args.slurm:
-      raise ConfigError("--slurm needs --launcher slurm")
-    return LocalLauncher(args.jobs or 1)
+  Another launcher takes nothing from the one before.
+
+  Raises:
+    ConfigError: The launcher has no such settings.
+  """
+  from apnpql_jax.sweeps.slurm import parse_settings
+
+  if args.launcher not in (None, stored.launcher):
+    stored = Launch(args.launcher)
+  if args.slurm and stored.launcher == "local":
+    raise ConfigError("--slurm needs --launcher slurm")
+  settings = {**stored.slurm, **parse_settings(args.slurm)}
+  return Launch(stored.launcher, settings, args.jobs or stored.jobs)
+
+
+def _launcher(manifest: Manifest) -> Launcher:
+  """Returns the launcher of a sweep."""
+  from apnpql_jax.sweeps.local import LocalLauncher
+  from apnpql_jax.sweeps.slurm import ALL_AT_ONCE, SlurmLauncher
+
+  launch = manifest.launch
+  if launch.launcher == "local":
+    return LocalLauncher(launch.jobs or 1)
   return SlurmLauncher(
     manifest.folder / "submitit",
-    jobs=args.jobs or ALL_AT_ONCE,
-    settings=parse_settings(args.slurm),
-    cluster="slurm" if args.launcher == "slurm" else "local",
+    jobs=launch.jobs or ALL_AT_ONCE,
+    settings=launch.slurm,
+    cluster="slurm" if launch.launcher == "slurm" else "local",
   )

@@ -3,12 +3,28 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
+import dataclasses
 from pathlib import Path
 import sys
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 from apnpql_jax.config import user_files
 from apnpql_jax.runs.run_folder import CONFIG_FILE
+
+LauncherName = Literal["local", "slurm", "slurm-local"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Launch:
+  """How a sweep starts its runs, so that a resume starts the others like that."""
+
+  launcher: LauncherName = "local"
+  slurm: Mapping[str, str | int] = dataclasses.field(default_factory=dict)
+  """Settings of the jobs as submitit names them."""
+
+  jobs: int | None = None
+  """Runs at the same time; the launcher decides if None."""
 
 
 class Work(NamedTuple):

@@ -7,13 +7,13 @@ import dataclasses
 import json
 from pathlib import Path
 import shlex
-from typing import Any
+from typing import Any, get_args
 
 from apnpql_jax.errors import ConfigError, FileError
 from apnpql_jax.reports import reading
 from apnpql_jax.runs.run_folder import CONFIG_FILE, load_run_config
 from apnpql_jax.runs.text import read_text, write_text
-from apnpql_jax.sweeps.launcher import Work
+from apnpql_jax.sweeps.launcher import Launch, LauncherName, Work
 from apnpql_jax.sweeps.plan import Planned
 
 MANIFEST_FILE = "sweep.json"
@@ -51,6 +51,7 @@ class Manifest:
 
   folder: Path
   runs: list[Entry]
+  launch: Launch = Launch()
 
   def run_dir(self, entry: Entry) -> Path:
     """Returns the run folder of an entry."""
@@ -77,8 +78,12 @@ class Manifest:
   def save(self) -> None:
     """Writes the manifest; a killed process leaves the one before."""
     runs = [dataclasses.asdict(entry) for entry in self.runs]
-    text = json.dumps({"format": _FORMAT, "runs": runs}, indent=1) + "\n"
-    write_text(self.folder / MANIFEST_FILE, text)
+    data = {
+      "format": _FORMAT,
+      "launch": dataclasses.asdict(self.launch),
+      "runs": runs,
+    }
+    write_text(self.folder / MANIFEST_FILE, json.dumps(data, indent=1) + "\n")
 
   def add(self, plan: Sequence[Planned]) -> None:
     """Adds the runs of a plan that are not there yet.
@@ -123,9 +128,10 @@ def load(folder: Path) -> Manifest:
     if data["format"] != _FORMAT:
       raise ValueError(f"format {data['format']}, not {_FORMAT}")
     runs = [_entry(run) for run in data["runs"]]
+    launch = _launch(data.get("launch", {}))
   except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
     raise FileError(f"{path} cannot be read: {error}") from None
-  return Manifest(folder.absolute(), runs)
+  return Manifest(folder.absolute(), runs, launch)
 
 
 def open_folder(folder: Path, plan: Sequence[Planned]) -> Manifest:
@@ -170,3 +176,20 @@ def _entry(data: dict[str, Any]) -> Entry:
   if not all(isinstance(word, str) for word in entry.argv):
     raise ValueError(f"the options of {entry.name} are not texts")
   return entry
+
+
+def _launch(data: dict[str, Any]) -> Launch:
+  """Returns how to start runs, read from JSON; earlier files do not have it.
+
+  Raises:
+    ValueError, TypeError: It does not name a launcher and its settings.
+  """
+  launch = Launch(**data)
+  settings = dict(launch.slurm)
+  if launch.launcher not in get_args(LauncherName):
+    raise ValueError(f"unknown launcher {launch.launcher!r}")
+  if not all(isinstance(value, str | int) for value in settings.values()):
+    raise ValueError("the settings of --slurm are not texts or numbers")
+  if launch.jobs is not None and launch.jobs < 1:
+    raise ValueError(f"jobs {launch.jobs}")
+  return dataclasses.replace(launch, slurm=settings)

@@ -8,10 +8,18 @@ from pathlib import Path
 import pytest
 from run_files import make_run
 
-from apnpql_jax.cli.sweep import check_begun, check_plan, config_of, parse_sweep
+from apnpql_jax.cli.sweep import (
+  check_begun,
+  check_plan,
+  config_of,
+  launch_of,
+  parse_sweep,
+  sweep,
+)
 from apnpql_jax.errors import ConfigError, FileError
 from apnpql_jax.runs import run_folder
 from apnpql_jax.sweeps import manifest as states
+from apnpql_jax.sweeps.launcher import Launch
 from apnpql_jax.sweeps.manifest import Manifest, find_equal, load, open_folder
 from apnpql_jax.sweeps.plan import make_plan
 
@@ -119,6 +127,7 @@ def test_options_that_the_sweep_does_not_have_are_those_of_train():
 
 
 PLAN = make_plan(["push_plate"], ["agent.epsilon=0.5,1"])
+SLURM = Launch("slurm", {"timeout_min": 240, "slurm_partition": "gpu"}, 3)
 
 
 def stored(folder: Path) -> Manifest:
@@ -132,9 +141,48 @@ def stored(folder: Path) -> Manifest:
 def test_a_manifest_is_read_as_it_was_written(tmp_path):
   made = stored(tmp_path / "sweep")
   made.runs[1].state, made.runs[1].line = states.FAILED, "apnpql: no"
+  made.launch = SLURM
   made.save()
   assert load(tmp_path / "sweep") == made
   assert [(x.name, x.argv) for x in made.runs] == PLAN
+
+
+@pytest.mark.parametrize(
+  ("line", "expected"),
+  [
+    ("", SLURM),
+    ("--launcher slurm", SLURM),
+    (
+      "--slurm timeout_min=60 --slurm cpus_per_task=8 --jobs 2",
+      Launch("slurm", {**SLURM.slurm, "timeout_min": 60, "cpus_per_task": 8}, 2),
+    ),
+    ("--launcher local", Launch()),
+    ("--launcher slurm-local --slurm mem_gb=4", Launch("slurm-local", {"mem_gb": 4})),
+  ],
+)
+def test_a_sweep_is_resumed_as_it_was_started_unless_told_otherwise(line, expected):
+  args = parse_sweep(["--resume", "runs/mine", *line.split()])
+  assert launch_of(args, SLURM) == expected
+
+
+def test_a_sweep_of_a_cluster_is_not_resumed_on_this_machine(tmp_path, monkeypatch):
+  """Its jobs may still run; this machine has no Slurm."""
+  monkeypatch.setenv("PATH", str(tmp_path))
+  made = stored(tmp_path / "sweep")
+  made.launch, made.runs[0].job = Launch("slurm"), "123"
+  made.save()
+  with pytest.raises(ConfigError, match="--launcher slurm needs"):
+    sweep(parse_sweep(["--resume", str(made.folder)]))
+  assert load(made.folder) == made
+
+
+def test_earlier_manifests_are_of_this_machine(tmp_path):
+  stored(tmp_path)
+  path = tmp_path / states.MANIFEST_FILE
+  data = json.loads(path.read_text())
+  del data["launch"]
+  path.write_text(json.dumps(data))
+  assert load(tmp_path).launch == Launch()
 
 
 def test_what_is_done_is_read_from_the_run_folders(tmp_path):
@@ -205,6 +253,12 @@ def test_a_folder_with_other_files_is_refused(tmp_path):
     lambda data: data["runs"][0].update(argv=[1]),
     lambda data: data["runs"][0].update(unknown=1),
     lambda data: data.update(runs=[3]),
+    lambda data: data.update(launch=3),
+    lambda data: data["launch"].update(launcher="elsewhere"),
+    lambda data: data["launch"].update(slurm={"timeout_min": [1]}),
+    lambda data: data["launch"].update(slurm=[1]),
+    lambda data: data["launch"].update(jobs=0),
+    lambda data: data["launch"].update(jobs="2"),
   ],
 )
 def test_a_foreign_manifest_is_refused_in_one_line(change, tmp_path: Path):
