@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 import re
+import shlex
+from string import Template
 
 import pytest
 
+from apnpql_jax.cli.sweep import check_plan, config_of, parse_sweep
 from apnpql_jax.doctor.software import EXTRAS
+from apnpql_jax.errors import ConfigError
+from apnpql_jax.sweeps.plan import make_plan
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted(
@@ -86,3 +91,46 @@ def test_the_table_of_extras_is_that_of_the_doctor():
   table = text.partition("## Extras")[2].partition("##")[0]
   rows = re.findall(r"^\| `(\w+)` \| (.+?)(?: \(.+\))? \|$", table, re.M)
   assert {extra: gives.replace("`", "") for extra, gives in rows} == EXTRAS
+
+
+def trainings(text: str) -> list[str]:
+  """Returns the `apnpql train` and `apnpql sweep` of the code blocks in ``text``."""
+  text = text.replace("\\\n", " ")
+  variables = dict(re.findall(r"^ +(\w+)=\"?([^\"\n]+)\"?$", text, re.M))
+  lines = re.findall(r"^ {4,}.*?\bapnpql ((?:train|sweep) .*)", text, re.M)
+  return [Template(line).safe_substitute(variables, seed="0") for line in lines]
+
+
+def check_training(line: str) -> None:
+  """Raises ``ConfigError`` if the settings of a command are refused."""
+  command, *words = shlex.split(line, comments=True)
+  if command == "train":
+    # A resume takes options on top of the settings of its run.
+    config_of(["push_plate", *words[2:]] if words[0] == "--resume" else words)
+  else:
+    args = parse_sweep(words)
+    plan = make_plan(args.presets, args.grid, seeds=args.seeds, options=args.train)
+    check_plan(plan)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda p: str(p.relative_to(ROOT)))
+def test_trainings_that_a_document_shows_are_accepted(document):
+  for line in trainings(document.read_text()):
+    if "touch_ball" not in line:
+      check_training(line)
+
+
+@pytest.mark.parametrize(
+  "text",
+  [
+    "    apnpql train push_plate --env.worlds 1024 --devices 0   # many",
+    "    srun .venv/bin/apnpql train push_plate \\\n      --replay.expert-steps 100",
+    "    half='--agent.epsilon 0'\n    apnpql train push_plate --run a $half",
+    "    apnpql train --resume runs/mine --agent.nothing 1",
+    "    apnpql sweep push_plate --grid agent.epsilon=1,1.0",
+  ],
+)
+def test_trainings_that_are_refused_are_found(text):
+  (line,) = trainings(text.replace("'", '"'))
+  with pytest.raises(ConfigError):
+    check_training(line)
