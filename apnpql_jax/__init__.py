@@ -23,7 +23,7 @@ if TYPE_CHECKING:
   from apnpql_jax.tasks.build import make_task
   from apnpql_jax.tasks.task import Task, register_task, task_names
   from apnpql_jax.training.diagnose import diagnose
-  from apnpql_jax.training.evaluate import evaluate
+  from apnpql_jax.training.evaluate import evaluate, load_trained
   from apnpql_jax.training.train import train
 
 _MODULES = {
@@ -37,7 +37,7 @@ _MODULES = {
   "tasks.build": ("make_task",),
   "tasks.task": ("Task", "register_task", "task_names"),
   "training.diagnose": ("diagnose",),
-  "training.evaluate": ("evaluate",),
+  "training.evaluate": ("evaluate", "load_trained"),
   "training.train": ("train",),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}

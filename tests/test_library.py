@@ -8,7 +8,6 @@ from pathlib import Path
 import re
 import subprocess
 import sys
-import textwrap
 
 import pytest
 
@@ -34,21 +33,20 @@ def output(folder: Path, script: str) -> str:
 
 
 def test_the_script_of_the_library_page_runs(tmp_path: Path):
-  rewards, trained, evaluated = output(tmp_path, SCRIPT).splitlines()
+  rewards, trained, evaluated, *actions = output(tmp_path, SCRIPT).splitlines()
   assert rewards.startswith("rewards: [")
   assert ast.literal_eval(trained)["env_steps"] == 32
   assert ast.literal_eval(evaluated)["episodes"] == 4
+  assert len(actions) > 4 and actions[0].startswith("actions at step 32 [[")
   assert (tmp_path / "runs" / "library" / "metrics.jsonl").exists()
 
 
 def test_the_other_interfaces_of_the_library_page_run(tmp_path: Path):
-  brax = BRAX.replace("32", "2")
-  prelude = "import jax, jax.numpy as jnp, apnpql_jax as apnpql\n"
-  body = textwrap.indent("apnpql.configure()\n" + brax + "print(state.done)\n", "  ")
-  script = GYMNASIUM.replace("num_envs=32", "num_envs=2")
-  script += f"  print(envs.reset()[0]['wrist_image'].shape)\n{body}"
-  lines = output(tmp_path, prelude + script).splitlines()
-  assert lines == ["(2, 36, 64, 3)", "[0. 0.]"]
+  gymnasium = GYMNASIUM.replace("num_envs=32", "num_envs=2")
+  gymnasium += "  print(envs.reset()[0]['wrist_image'].shape)\n"
+  assert output(tmp_path, gymnasium) == "(2, 36, 64, 3)\n"
+  brax = BRAX.replace("32", "2") + "  print(state.done)\n"
+  assert output(tmp_path, brax) == "[0. 0.]\n"
 
 
 @pytest.mark.slow

@@ -139,7 +139,7 @@ def evaluate(
 
 
 class Trained(NamedTuple):
-  """What a checkpoint needs to act."""
+  """A run that can act: ``agent.act(params, observation, key)``."""
 
   config: TrainConfig
   env: Env
@@ -151,15 +151,23 @@ class Trained(NamedTuple):
 def load_trained(
   run_dir: Path | str,
   *,
-  backend: str | None,
-  step: int | None,
+  backend: str | None = None,
+  step: int | None = None,
   bank_seed: int = reset_bank.SEED,
   held_out: int = 0,
 ) -> Trained:
   """Restores the weights of a run, and builds its worlds and agent.
 
-  ``backend``, ``step`` and ``bank_seed`` are as in ``evaluate``, and so are the errors.
-  A bank of another seed has at least ``held_out`` held-out rows.
+  Args:
+    run_dir: The run folder.
+    backend: Physics engine; that of the run if None.
+    step: Step of the checkpoint; the newest if None.
+    bank_seed: Seed of the reset states, as in ``evaluate``.
+    held_out: Fewest held-out rows of a bank whose seed is not the default.
+
+  Raises:
+    ConfigError: An argument is invalid; nothing was built.
+    FileError: Not a run folder, or no readable checkpoint.
   """
   if not 0 <= bank_seed < 2**31:
     raise ConfigError(f"bank_seed={bank_seed} must be within 0 and 2**31 - 1")
