@@ -9,6 +9,7 @@ import inspect
 import json
 import os
 from pathlib import Path
+import re
 import shutil
 import signal
 from typing import Any
@@ -148,6 +149,15 @@ def test_a_run_writes_all_its_files(finished):
   assert np.abs(frames[0].astype(int) - frames[8]).max() > 50
 
 
+def test_the_documents_explain_every_metric_of_a_run(finished):
+  page = (testing.ROOT / "docs" / "diagnose.md").read_text()
+  rows = re.findall(r"^\| (`.+?) \|", page.partition("## Metrics")[2], re.M)
+  explained = re.findall(r"`(.+?)`", " ".join(rows))
+  written = {name for row in testing.rows(finished[0]) for name in row}
+  # This row of Table I has no parametric policy.
+  assert sorted(explained) == sorted(written | {"grad_norm/policy", "loss/policy"})
+
+
 def test_evaluate_reports_the_newest_checkpoint(finished, tmp_path):
   run_dir, _ = finished
   video = tmp_path / "videos" / "two.mp4"
@@ -182,7 +192,7 @@ def test_a_checkpoint_is_read_before_the_run_may_remove_it(
     return make_env(*args, **options)
 
   monkeypatch.setattr(evaluation, "make_env", make_slowly)
-  assert evaluation.load_trained(run, backend=None, step=32).step == 32
+  assert evaluation.load_trained(run, step=32).step == 32
 
 
 @pytest.mark.parametrize(
