@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import tyro
 
 from apnpql_jax.cli.commands import checkpoint_step, existing_run
-from apnpql_jax.cli.options import Flag, OfRun, default_hint
+from apnpql_jax.cli.options import Acting, Flag, OfRun
 from apnpql_jax.errors import ConfigError
 
 
@@ -33,7 +33,7 @@ class Export(OfRun):
   checkpoint: str = "newest"
   """Checkpoint: newest, best (highest success rate in training) or its step."""
 
-  acting: Annotated[str | None, default_hint("(default: as in training)")] = None
+  acting: Acting = None
   """How to choose an action, see `apnpql evaluate --help`. Only mean needs no key."""
 
   overwrite: Flag = False

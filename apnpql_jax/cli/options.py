@@ -28,6 +28,9 @@ Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 _OfPreset = Annotated[str | None, default_hint("(default: as in the preset)")]
 Count = Annotated[int | None, default_hint("")]
 AsTrained = Annotated[str | None, default_hint("(default: as in training)")]
+Acting = Annotated[
+  str | None, default_hint("(default: as in the evaluations of the run)")
+]
 File = Annotated[Path | None, default_hint("")]
 
 
@@ -131,9 +134,10 @@ class _HeldOut(OfRun):
   checkpoint: str = "newest"
   """Checkpoint: newest, best (highest success rate in training) or its step."""
 
-  acting: AsTrained = None
-  """How to choose an action: policy draws from the policy, mean takes the mean of its
-  likeliest component, prior draws from b without Q, greedy takes the highest Q."""
+  acting: Acting = None
+  """How to choose an action: policy draws from the policy; mean takes the component
+  mean, with either gripper command, where the density of the policy is highest; prior
+  draws from b without Q; greedy takes the highest Q."""
 
   bank_seed: int = 0
   """Seed of the states that episodes start from. Another than 0 draws states on which

@@ -14,7 +14,7 @@ from apnpql_jax.cli.commands import (
   existing_run,
   task_env,
 )
-from apnpql_jax.cli.options import AsTrained, File, Flag, OfRun, default_hint
+from apnpql_jax.cli.options import Acting, File, Flag, OfRun, default_hint
 from apnpql_jax.errors import ConfigError
 
 EXPERT = "expert"
@@ -62,7 +62,7 @@ class Transfer(OfRun):
   checkpoint: str = "newest"
   """Checkpoint: newest, best (highest success rate in training) or its step."""
 
-  acting: AsTrained = None
+  acting: Acting = None
   """How to choose an action, see `apnpql evaluate --help`."""
 
   episodes: int = 200

@@ -15,7 +15,7 @@ from apnpql_jax.cli.commands import (
   run_config,
   task_env,
 )
-from apnpql_jax.cli.options import AsTrained, File, Flag, OfRun
+from apnpql_jax.cli.options import Acting, AsTrained, File, Flag, OfRun
 from apnpql_jax.console import print_line
 from apnpql_jax.errors import ConfigError
 
@@ -46,7 +46,7 @@ class Watch(OfRun):
   """Checkpoint: newest, best (highest success rate in training) or its step. The newest
   is replaced by newer ones while a run trains."""
 
-  acting: AsTrained = None
+  acting: Acting = None
   """How to choose an action: policy, mean, prior or greedy, see apnpql evaluate."""
 
   backend: AsTrained = None
