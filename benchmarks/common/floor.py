@@ -54,7 +54,7 @@ def machine_peak() -> Peak:
   square = jnp.ones((size, size))
   # Larger than any cache, and in place, because fresh memory costs page faults.
   copied = jnp.ones(length)
-  with turns.turn("peak"):
+  with turns.turn():
     product = _fastest(jax.jit(lambda x: square @ x / size), jnp.copy(square))
     copy = _fastest(jax.jit(lambda x: x + 1.0, donate_argnums=0), copied)
   return Peak(2 * size**3 / product, 8 * length / copy)

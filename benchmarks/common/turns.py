@@ -14,12 +14,12 @@ FOLDER = "BENCHMARK_TURNS"  # environment variable with the folder of the lock f
 
 
 @contextlib.contextmanager
-def turn(name: str = "device", *, shared: bool = False) -> Generator[None]:
+def turn(*, shared: bool = False) -> Generator[None]:
   """Waits for a turn: to measure alone, or ``shared`` with others who compile."""
   folder = os.environ.get(FOLDER)
   if folder is None:
     yield
     return
-  with (Path(folder) / name).open("w") as file:
+  with (Path(folder) / "device").open("w") as file:
     fcntl.flock(file, fcntl.LOCK_SH if shared else fcntl.LOCK_EX)
     yield  # Closing the file releases the lock.

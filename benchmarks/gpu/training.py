@@ -35,7 +35,7 @@ def main() -> None:
 
 
 def measure(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-  """Yields the figures of a training, during which nobody else measures."""
+  """Yields the figures of a training; others may compile meanwhile, none measures."""
   options = testing.TINY_ARGS if args.quick else OPTIONS
   with turns.turn(shared=True), tempfile.TemporaryDirectory() as name:
     run = Path(name) / "run"

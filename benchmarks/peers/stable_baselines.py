@@ -5,7 +5,7 @@
 Both see the same observations, have as many transitions of the scripted expert, and
 play the same held-out episodes. SAC is that of ``apnpql_jax.gym.sac``, in worlds that
 one program steps. Ours is the preset. Minutes count from the start of learning, with
-evaluations; imports, compilation and the expert's play come before.
+evaluations, and with the compilation that imports and the expert's play do not cover.
 """
 
 import argparse

@@ -56,7 +56,8 @@ def measure(name: str, backend: str, setting: str, episodes: int) -> dict[str, f
   if contacts:
     model.numeric("max_contact_points").data[:] = contacts
   # A new fingerprint, because C MuJoCo is set up once for each.
-  task.scene = dataclasses.replace(task.scene, fingerprint=setting)
+  fingerprint = f"{name} {setting}"
+  task.scene = dataclasses.replace(task.scene, fingerprint=fingerprint)
   env = Env(config, task, bank)
   play = make_player(env, lambda _: expert_policy(env, noise=0.0))
   played = play_held_out(env, play, None, episodes=episodes, seed=0)

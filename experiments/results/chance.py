@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 import numpy as np
 
-from apnpql_jax import load_preset, make_env
+from apnpql_jax import configure, load_preset, make_env
 from apnpql_jax.envs.env import HELD_OUT_SHARE
 from apnpql_jax.envs.state import EnvState
 from apnpql_jax.training.evaluate import figures_of, held_out_batches
@@ -65,6 +65,7 @@ def play(task: str) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
+  configure()
   found = {task: play(task) for task in TASKS}
   path = Path(__file__).resolve().with_suffix(".json")
   path.write_text(json.dumps(found, indent=1) + "\n")

@@ -79,8 +79,8 @@ def test_parametric_policy_sums_over_the_gripper(heads):
   expected = jax.nn.sigmoid(policy.gripper_logits[:, 0])
   np.testing.assert_allclose(closed, expected, rtol=1e-4)
   mean = jnp.sum(pi.weights[..., None] * pi.samples[..., :6], axis=0)
-  error = (mean - policy.loc[:, 0]) / (policy.scale_tril[:, 0].std() + 0.3)
-  assert np.abs(error).max() < 5.0 / np.sqrt(200)
+  std = jnp.linalg.norm(policy.scale_tril[:, 0], axis=-1)
+  assert np.abs((mean - policy.loc[:, 0]) / std).max() < 5.0 / np.sqrt(200)
   np.testing.assert_allclose(
     pi.log_prob(pi.samples, pi.q_values), policy.log_prob(pi.samples), rtol=1e-5
   )
@@ -152,12 +152,6 @@ def test_uniform_box_is_a_distrax_distribution():
   np.testing.assert_allclose(log_prob, expected, rtol=1e-5)
   np.testing.assert_array_equal(box.log_prob(3.0 * samples), log_prob)
   np.testing.assert_allclose(box.entropy(), sides.entropy() + np.log(2.0), rtol=1e-6)
-
-
-def test_reverse_kl_of_a_gaussian_and_a_uniform_prior_is_exact(heads):
-  step = policy_update.reverse_kl(heads, UniformBox((STATES,), 6), jax.random.key(4))
-  expected = 7.0 * np.log(2.0) - heads.policy().entropy_bound()
-  assert np.mean(step.kl - expected) == pytest.approx(0.0, abs=0.1)
 
 
 def test_reverse_kl_weighs_draws_of_pi_as_q_does(heads):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
+import re
 
 import ablations
 from comparison import PAPER, TASKS, Comparison
@@ -15,10 +16,12 @@ import search
 import state_comparison
 import update_budget
 
+from apnpql_jax import testing
 from apnpql_jax.agents.table_one import epsilon_bounds
 from apnpql_jax.config.checks import validate
 from apnpql_jax.config.files import config_diff
 
+RESULTS = testing.ROOT / "experiments" / "results"
 COMPARISONS = [state_comparison.COMPARISON, pixel_comparison.COMPARISON]
 OTHERS = [x.COMPARISON for x in (search, ablations, update_budget, constraint)]
 RUNS = [
@@ -166,6 +169,17 @@ def test_the_stored_budgets_give_the_stored_effects():
 def test_no_result_from_states_is_missing():
   comparison = state_comparison.COMPARISON
   assert len(comparison.results()) == len(TASKS) * len(PAPER) + 2
+
+
+def test_the_documents_have_the_successes_of_chance():
+  stored = json.loads((RESULTS / "chance.json").read_text())
+  (counts,) = re.findall(
+    r"solves (.+?) of\s512 episodes \(`python experiments/results/chance.py`\)",
+    (testing.ROOT / "docs" / "algorithm.md").read_text().replace("\n", " "),
+  )
+  found = {task: int(x) for x, task in re.findall(r"(\d+) \((\w+)\)", counts)}
+  assert found == {task: figures["successes"] for task, figures in stored.items()}
+  assert {figures["episodes"] for figures in stored.values()} == {512}
 
 
 @by_folder

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from apnpql_jax.cli.new_task import NewTask, new_task
 from apnpql_jax.config.files import mjcf_path
@@ -21,6 +22,7 @@ from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.envs.state import EnvState
 from apnpql_jax.randomization.draw import free_bodies
 from apnpql_jax.randomization.randomize import make_randomize
+from apnpql_jax.render import Lighting
 from apnpql_jax.sim import arm, engines, motors, physics
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.sim.scene import load_scene
@@ -146,6 +148,61 @@ def test_draws_fill_their_range_and_differ_between_worlds(task, drawn):
   assert delay.min() >= 0 and 0 < delay.max() <= 6  # Steps of 5 ms in 30 ms.
   light = fields["light_ambient"] + fields["light_diffuse"]
   assert light.max() <= 1.0 + 1e-6
+
+
+def test_turns_lights_and_textures_fill_their_range(task, drawn):
+  model, fields = task.scene.model, {k: np.asarray(v) for k, v in drawn.fields.items()}
+  cameras = [
+    turn_between(model.cam_quat[i], fields["cam_quat"][:, i]) for i in range(model.ncam)
+  ]
+  base = model.body("base").id
+  # About the world's axes: the inverses turn about the base's own.
+  table = turn_between(
+    inverse(model.body_quat[base]), inverse(fields["body_quat"][:, base])
+  )
+  plain, odd = fields["geom_rgba"][..., :3], fields["odd_rgb"][:, : model.ngeom]
+  plate = model.geom("plate_floor").id
+  light, full = Lighting(), fields["light_ambient"] + fields["light_diffuse"] > 0.999
+  level = [  # Brighter worlds are scaled down to one.
+    fields["light_ambient"][~full] / light.ambient - 1,
+    fields["light_diffuse"][~full] / light.diffuse - 1,
+  ]
+  for name, found in {
+    "light_turn": fields["light_dir"] - model.light_dir,
+    "camera_turn": np.stack(cameras),
+    "table_tilt": table[:, :2],
+    "table_turn": table[:, 2],
+    "light_level": np.concatenate(level),
+    "texture": (odd - plain)[:, plate],
+  }.items():
+    most = getattr(ALL, name)
+    assert np.abs(found).max() <= 1.01 * most, name
+    assert found.min() < -0.2 * most and found.max() > 0.2 * most, name
+    assert np.abs(found).max() > 0.5 * most, name
+  assert 0.5 * ALL.texture < fields["grain"].max() <= 2 * ALL.texture
+  robot = model.body_rootid[model.dof_bodyid] == base
+  added = (fields["dof_damping"] - model.dof_damping) / fields["dof_M0"]
+  assert (added[:, ~robot] == 0).all() and added[:, robot].min() >= 0
+  assert 0.5 * ALL.damping < added[:, robot].max() <= 1.001 * ALL.damping
+
+
+def turn_between(quat: np.ndarray, turned: np.ndarray) -> np.ndarray:
+  """Returns rotation vectors f64[*b, 3] about the own axes of ``quat`` f64[4]."""
+  first, second = (Rotation.from_quat(np.roll(x, -1, axis=-1)) for x in (quat, turned))
+  return (first.inv() * second).as_rotvec()
+
+
+def inverse(quat: np.ndarray) -> np.ndarray:
+  return quat * [1.0, -1.0, -1.0, -1.0]
+
+
+def test_objects_are_scaled_within_their_range(task):
+  fields = _randomized(task, dataclasses.replace(NONE, size=ALL.size)).fields
+  plate = task.scene.model.geom("plate_floor").id
+  ratio = np.asarray(fields["geom_size"])[:, plate] / task.scene.model.geom_size[plate]
+  assert np.abs(ratio[:, :2] - 1).max() <= 1.001 * ALL.size
+  assert np.ptp(ratio[:, 0]) > 0.5 * ALL.size
+  np.testing.assert_allclose(ratio[:, 0], ratio[:, 1], rtol=1e-5)
 
 
 @pytest.mark.parametrize(("camera", "share"), [("global", 1.0), ("wrist", 0.1)])

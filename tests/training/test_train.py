@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 import dataclasses
+import importlib.metadata
 import inspect
 import json
 import os
@@ -14,6 +15,7 @@ import signal
 from typing import Any
 
 import imageio.v3 as iio
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -27,6 +29,7 @@ from apnpql_jax.config.ranges import (
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.envs.env import Env
 from apnpql_jax.errors import ConfigError, FileError, UserError
+from apnpql_jax.primitives import reset_bank
 from apnpql_jax.runs import checkpoint_reader, run_folder
 from apnpql_jax.training import evaluate as evaluation, reporter
 from apnpql_jax.training.evaluate import evaluate
@@ -132,7 +135,7 @@ def test_a_run_writes_all_its_files(finished):
   assert summary["env_steps"] == 64 and summary["updates"] == 16
   assert summary["episodes"] == 4
   versions = json.loads((run_dir / "versions.json").read_text())
-  assert versions["packages"]["mujoco"] == "3.17.0"
+  assert versions["packages"]["mujoco"] == importlib.metadata.version("mujoco")
   lines = (run_dir / "metrics.jsonl").read_text().splitlines()
   rows = [json.loads(line) for line in lines]
   assert [row["step"] for row in rows if "loss/q" in row] == [*range(8, 72, 8)]
@@ -162,12 +165,20 @@ def test_evaluate_reports_the_newest_checkpoint(finished, tmp_path):
   assert 0 <= low <= figures["success_rate"] <= high <= 1
 
 
-def test_evaluate_plays_from_states_of_another_bank(finished):
-  run_dir, _ = finished
-  played = [evaluate(run_dir, episodes=3, bank_seed=seed) for seed in (1, 1, 2)]
-  assert all(figures["episodes"] == 3 for figures in played)
-  lengths = [figures["mean_length"] for figures in played]
-  assert lengths[0] == lengths[1]
+def test_evaluate_plays_from_states_of_another_bank(finished, monkeypatch):
+  make_env, played = evaluation.make_env, []
+
+  def make(*args: Any, **options: Any) -> Env:
+    env = make_env(*args, **options)
+    played.append(np.asarray(env.begin(jnp.arange(3)).physics.qpos))
+    return env
+
+  monkeypatch.setattr(evaluation, "make_env", make)
+  for seed in (reset_bank.SEED, 1, 1, 2):
+    assert evaluate(finished[0], episodes=3, bank_seed=seed)["episodes"] == 3
+  default, one, same, two = played
+  np.testing.assert_array_equal(one, same)
+  assert not np.array_equal(one, two) and not np.array_equal(one, default)
 
 
 def test_a_checkpoint_is_read_before_the_run_may_remove_it(
