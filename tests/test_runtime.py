@@ -68,7 +68,7 @@ def test_import_changes_no_variable_and_starts_no_backend():
 
 def test_no_import_prints_about_the_optional_warp():
   """MJX prints when it is imported; only the module that hides that may import it."""
-  modules = (ROOT / "apnpql_jax").rglob("*.py")
+  modules = [p for x in ("apnpql_jax", "benchmarks") for p in (ROOT / x).rglob("*.py")]
   users = {p.stem for p in modules if re.search(IMPORTS_MJX, p.read_text())}
   assert users == {"quiet_mjx"}
   assert run("import apnpql_jax.envs.contact_report") == ""

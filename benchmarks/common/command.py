@@ -9,6 +9,8 @@ import argparse
 from collections.abc import Iterable, Sequence
 import json
 import os
+import shlex
+import sys
 from typing import Any
 
 import jax
@@ -40,6 +42,7 @@ def parse(
   ``--quick`` also compiles without optimization.
   """
   args = options.parse_args(argv)
+  args.options = shlex.join(sys.argv[1:] if argv is None else argv)
   if args.quick and args.store:
     options.error("--quick figures mean nothing; nothing is stored")
   if args.quick:
@@ -61,7 +64,8 @@ def publish(
 
   ``header`` holds the settings that all results share.
   """
-  report: dict[str, Any] = {"benchmark": name, **store.machine(), **header}
+  report: dict[str, Any] = {"benchmark": name, "options": args.options}
+  report |= store.machine() | header
   if "precision" in args:
     peak = floor.machine_peak()._asdict()
     report |= {"peak": peak, "repeats": args.repeats, "precision": args.precision}

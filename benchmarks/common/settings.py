@@ -63,12 +63,19 @@ def changed(config: TrainConfig, section: str, **values: Any) -> TrainConfig:
   return dataclasses.replace(config, **{section: part})
 
 
-def with_candidates(config: TrainConfig, count: int) -> TrainConfig:
-  """Returns the same training with another number of candidates in the target.
+def with_candidates(
+  config: TrainConfig, count: int, precision: str = "float32"
+) -> TrainConfig:
+  """Returns the same training with other candidates: ``count`` in the target.
 
   The policy has five for six of them, as in the paper, 100 for 120.
   """
-  # Epsilon must stay below the log of the candidates; it costs no time.
-  epsilon = min(config.agent.epsilon, 1.0)
-  counts = {"target_samples": count, "policy_samples": max(2, count * 5 // 6)}
-  return changed(config, "agent", **counts, epsilon=epsilon)
+  return changed(
+    config,
+    "agent",
+    target_samples=count,
+    policy_samples=max(2, count * 5 // 6),
+    # Must stay below the log of the candidates; it costs no time.
+    epsilon=min(config.agent.epsilon, 1.0),
+    candidate_precision=precision,
+  )

@@ -62,6 +62,12 @@ COLUMNS = {
 """A column is HEAD=PATH:FORM; without a path the head is the key of the result."""
 
 
+SETTINGS = "batch candidates candidate_precision states processes worlds rounds".split()
+"""Settings that a caption names."""
+
+SMALL = 0.01  # share of a part of a time line that has no row of its own
+
+
 def block(report: Report) -> str:
   """Returns a caption and the tables of a report."""
   name = report["benchmark"]
@@ -74,17 +80,17 @@ def block(report: Report) -> str:
 
 def caption(report: Report) -> str:
   """Returns command, commit, machine and settings of a report."""
-  versions = report["versions"]
-  command = report.get("command") or f"{module(report['benchmark'])} --store"
+  versions, cores = report["versions"], report["cores"]
+  command = f"{module(report['benchmark'])} {report.get('options', '...')}"
   parts = [
-    f"`python -m {command}`",
+    f"`python -m {report.get('command', command)}`",
     f"commit {report['commit'] or 'unknown'}",
-    f"{report['device']}, {report['cores']} cores",
+    f"{report['device']}, {cores} core{'s' * (cores > 1)}",
     *(f"{name} {versions[name]}" for name in ("jax", "mujoco") if name in versions),
     *(report[key] for key in ("scene", "preset") if key in report),
   ]
-  for key in ("batch", "candidates", "states", "processes", "worlds", "rounds"):
-    parts += [f"{key} {report[key]}"] if key in report else []
+  for key in SETTINGS:
+    parts += [f"{key.replace('_', ' ')} {report[key]}"] if key in report else []
   if report.get("precision", "highest") != "highest":
     parts.append(report["precision"])
   if "oracle" in report:
@@ -190,6 +196,14 @@ def encoder_layouts(report: Report) -> Prepared:
   return rows, []
 
 
+def timeline(report: Report) -> Prepared:
+  """Merges small parts into the rest, which follows the others."""
+  *parts, whole = report["results"]
+  large = [x for x in parts if x["share"] >= SMALL and x["part"] != "rest"]
+  rest = {k: sum(x[k] for x in parts if x not in large) for k in ("ms", "share")}
+  return [*large, {"part": "rest"} | rest, whole], []
+
+
 def with_parts(report: Report) -> Prepared:
   """Adds a table with the share of each part, and what it reaches of its limit."""
   names = dict.fromkeys(name for r in report["results"] for name in r["parts"])
@@ -255,6 +269,8 @@ def exponent(last: Result | None, point: Result) -> str:
 PREPARE: dict[str, Callable[[Report], Prepared]] = {
   "render": render,
   "learner": learner,
+  "timeline": timeline,
+  "physics_timeline": timeline,
   "encoder_layouts": encoder_layouts,
   "env_steps": with_parts,
   "end_to_end": with_parts,

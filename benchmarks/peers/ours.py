@@ -65,8 +65,7 @@ def learner(settings: sides.Settings) -> dict[str, sides.Measure]:
   """Returns a measure of updates on noise, in a loop as long as an iteration."""
   config = load_preset(settings["preset"])
   config = changed(config, "replay", batch_size=settings["batch"])
-  config = with_candidates(config, settings["candidates"])
-  config = changed(config, "agent", candidate_precision=settings["precision"])
+  config = with_candidates(config, settings["candidates"], settings["precision"])
   agent, batch = make_agent(config.agent), noise.transitions(config)
   state = agent.init(jax.random.key(0), batch.observation_tm1)
   count = config.updates_per_iteration

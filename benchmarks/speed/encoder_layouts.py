@@ -29,12 +29,16 @@ def main() -> None:
   parser = command.parser(__doc__, repeats=15)
   parser.add_argument("--preset", default="push_plate")
   parser.add_argument("--batch", type=int, default=64)
+  parser.add_argument("--candidates", type=int, default=120)
   parser.add_argument("--layouts", nargs="+", choices=LAYOUTS, default=list(LAYOUTS))
   args = command.parse(parser)
-  args.batch = 8 if args.quick else args.batch
+  if args.quick:
+    args.batch, args.candidates = 8, 8
   config = settings.preset(args.preset, quick=args.quick)
   config = settings.changed(config, "replay", batch_size=args.batch)
-  header = {"preset": args.preset, "batch": args.batch}
+  config = settings.with_candidates(config, args.candidates)
+  header = {name: getattr(args, name) for name in ("preset", "batch", "candidates")}
+  header["candidate_precision"] = config.agent.candidate_precision
   command.publish("encoder_layouts", args, measure_all(config, args), **header)
 
 

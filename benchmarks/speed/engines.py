@@ -15,11 +15,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import mujoco
-from mujoco import mjx
 import mujoco.rollout
 import numpy as np
 
 from apnpql_jax.envs.contact_report import SUBSTEPS
+from apnpql_jax.sim.quiet_mjx import mjx
 from apnpql_jax.tasks import Task, make_task
 from apnpql_jax.types import Array
 from benchmarks.common import command, timing

@@ -18,7 +18,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import mujoco
-from mujoco import mjx
 import numpy as np
 
 from apnpql_jax import devices
@@ -31,14 +30,16 @@ from apnpql_jax.envs.env import make_env
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.sim.engines import make_physics
 from apnpql_jax.sim.physics import initial_state
+from apnpql_jax.sim.quiet_mjx import mjx
 from apnpql_jax.sim.scene import Scene, load_scene
 from apnpql_jax.tasks import make_task
 from apnpql_jax.training.rollout import example_slot
 from benchmarks.common import command, floor, noise, parts, settings, timing
 from benchmarks.speed import env_steps, learner
 
-WORLDS, PLAYED = 32, 16
-"""Worlds, except along their axis; periods after the reset at which they are timed."""
+WORLDS, CANDIDATES, PLAYED = 32, 120, 16
+"""Worlds and candidates, except along their axes; periods after the reset at which
+worlds are timed."""
 
 Sizes = Iterator[tuple[Any, ...]]
 """Series, size, a function that prepares it, and its arguments."""
@@ -98,6 +99,7 @@ def pixels(config: TrainConfig, args: argparse.Namespace) -> Sizes:
     names = ("global_size", "wrist_size")
     sides = {k: tuple(round(scale * x) for x in getattr(config.env, k)) for k in names}
     chosen = settings.changed(config, "env", **sides, worlds=WORLDS)
+    chosen = settings.with_candidates(chosen, CANDIDATES)
     size = sum(height * width for height, width in sides.values())
     yield "rendering", size, _images, chosen.env
     yield "update", size, _update, chosen

@@ -54,7 +54,6 @@ def measure_all(config: TrainConfig, args: argparse.Namespace) -> Iterator[Resul
   for batch, candidates in itertools.product(args.batch, args.candidates):
     chosen = settings.changed(config, "replay", batch_size=batch)
     chosen = settings.with_candidates(chosen, candidates)
-    chosen = settings.changed(chosen, "agent", candidate_precision="float32")
     transitions = noise.transitions(chosen)
     ready = {phi: prepare(AGENTS[phi](chosen.agent), transitions) for phi in args.phi}
     found = timing.figures("update", ready, repeats=args.repeats)

@@ -42,11 +42,11 @@ def main() -> None:
   if args.quick:
     args.batch, args.candidates = 8, 8
   config = settings.changed(config, "replay", batch_size=args.batch)
-  config = settings.with_candidates(config, args.candidates)
+  precision = config.agent.candidate_precision
+  config = settings.with_candidates(config, args.candidates, precision)
   header = {name: getattr(args, name) for name in ("preset", "batch", "candidates")}
-  precision = {"candidate_precision": config.agent.candidate_precision}
-  results = measure_all(config, args)
-  command.publish("timeline", args, results, **header, **precision)
+  header["candidate_precision"] = precision
+  command.publish("timeline", args, measure_all(config, args), **header)
 
 
 def measure_all(config: TrainConfig, args: argparse.Namespace) -> Iterator[Result]:

@@ -9,6 +9,7 @@ import itertools
 import json
 import os
 import pkgutil
+import shlex
 import subprocess
 import sys
 import threading
@@ -27,6 +28,7 @@ from apnpql_jax.runs.metrics import MetricWriter
 from apnpql_jax.sim.scene import load_scene
 import benchmarks
 from benchmarks.common import (
+  command,
   floor,
   noise,
   parts,
@@ -100,6 +102,9 @@ def dicts(tree: Any) -> Iterator[dict[str, Any]]:
 def test_a_benchmark_reports_its_figures(name, args):
   found = run(reports.module(name), *args)
   assert found["benchmark"] == name and found["results"]
+  assert shlex.split(found["options"]) == ["--quick", "--json", *args]
+  if name in ("timeline", "encoder_layouts"):
+    assert "candidates 8, candidate precision" in reports.caption(found)
   assert found["cores"] >= 1 and found["versions"]["jax"] == jax.__version__
   if "peak" in found:
     assert min(found["peak"].values()) > 0 and found["repeats"]
@@ -116,6 +121,31 @@ def test_a_benchmark_reports_its_figures(name, args):
       assert entry["qpos_differs"] < 1e-4
   # The document can be made of it.
   assert "| --- |" in reports.block(found)
+
+
+def test_a_caption_has_the_options_of_its_run(capsys):
+  parser = command.parser("A benchmark.")
+  parser.add_argument("--batch", type=int)
+  args = command.parse(parser, ["--json", "--batch", "64"])
+  command.publish("learner", args, [])
+  caption = reports.caption(json.loads(capsys.readouterr().out))
+  assert caption.startswith("`python -m benchmarks.speed.learner --json --batch 64`")
+  # Older reports did not keep them.
+  caption = reports.caption(MACHINE | {"benchmark": "learner", "cores": 1})
+  assert caption.startswith("`python -m benchmarks.speed.learner ...`")
+  assert "a machine, 1 core, " in caption
+
+
+def test_small_parts_of_a_time_line_are_in_its_rest():
+  shares = {"large": 0.9, "rest": 0.085, "small": 0.009, "smaller": 0.006}
+  results = [{"part": k, "ms": 10 * x, "share": x} for k, x in shares.items()]
+  results.append({"part": "by the clock", "ms": 5.0})
+  lines = reports.block(MACHINE | {"benchmark": "timeline", "results": results})
+  assert lines.splitlines()[-3:] == [
+    "| large | 9 | 90 % |",
+    "| rest | 1 | 10 % |",
+    "| by the clock | 5 |  |",
+  ]
 
 
 def test_every_module_can_be_imported():

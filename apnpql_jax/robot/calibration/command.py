@@ -250,7 +250,7 @@ def _picture(contract: Json, name: str, found: _Found, out: Path) -> Path | None
 def _summary(about: Json) -> Json:
   """Returns the numbers to show of a camera."""
   residuals, difference = about["residuals"], about["difference"]
-  held_out = residuals.get("held_out", residuals)
+  held_out = residuals["held_out"]
   return {
     "views": residuals["views"],
     "error_px": round(residuals["px"], 3),

@@ -66,15 +66,17 @@ def solve_fixed(problem: Problem, board: np.ndarray) -> Solution:
   """Returns the pose of a fixed camera that sees a board at a known pose.
 
   Raises:
-    ConfigError: The views contradict each other.
+    ConfigError: There is one view, or the views contradict each other.
   """
+  if len(problem.seen) < 2:
+    raise ConfigError("one view shows the board, but at least 2 are needed, better 5")
   poses = np.stack([problem.lens.board_pose(problem.board, x) for x in problem.seen])
   guesses = [board @ np.linalg.inv(pose) for pose in poses]
   medians = [np.median(problem.error_of_views(x, board)) for x in guesses]
   camera = guesses[int(np.argmin(medians))]
   camera, board, kept = _without_outliers(problem, camera, board, fixed=True)
   good = problem.select(np.flatnonzero(kept))
-  residuals: dict[str, Any] = _consistency(good, poses[kept], camera, board)
+  residuals = _residuals(good, poses[kept], camera, board, fixed=True)
   residuals |= {"views": int(kept.sum()), "outliers": np.flatnonzero(~kept).tolist()}
   return Solution(camera, board, kept, "PnP", residuals)
 
@@ -186,15 +188,20 @@ def _check_scale(problem: Problem, camera: np.ndarray, board: np.ndarray) -> Non
 
 
 def _residuals(
-  problem: Problem, poses: np.ndarray, camera: np.ndarray, board: np.ndarray
+  problem: Problem,
+  poses: np.ndarray,
+  camera: np.ndarray,
+  board: np.ndarray,
+  *,
+  fixed: bool = False,
 ) -> dict[str, Any]:
   """Returns errors on all views, on views that were held out, and uncertainties."""
-  _, _, found = refine(problem, camera, board)
+  _, _, found = refine(problem, camera, board, fixed=fixed)
   deviation = deviations(found)
-  rows, held_out = np.arange(len(poses)), []
-  for fold in range(_FOLDS):
-    test = rows % _FOLDS == fold
-    cameras = refine(problem.select(rows[~test]), camera, board)[:2]
+  rows, folds, held_out = np.arange(len(poses)), min(_FOLDS, len(poses)), []
+  for fold in range(folds):
+    test = rows % folds == fold
+    cameras = refine(problem.select(rows[~test]), camera, board, fixed=fixed)[:2]
     held_out.append(_consistency(problem.select(rows[test]), poses[test], *cameras))
   return _consistency(problem, poses, camera, board) | {
     "held_out": {

@@ -170,8 +170,17 @@ def test_a_board_on_the_table_serves_both_cameras(contract, wrist, tmp_path):
     write_views(folder / "global", made, "global", np.array(aside))
     truth = made.truth("global")
   out = tmp_path / "calibration.json"
-  command.calibrate(contract, folder, out, board_on="table")
-  assert_close(files.load(out, contract).cameras["global"].pose, truth)
+  result = command.calibrate(contract, folder, out, board_on="table")
+  camera = files.load(out, contract).cameras["global"]
+  assert_close(camera.pose, truth)
+  residuals = camera.about["residuals"]
+  assert 0 < residuals["deviation_mm"] < MOST_MM
+  assert residuals["px"] < residuals["held_out"]["px"] < 0.6
+  assert result["global"]["error_mm"] == round(residuals["held_out"]["mm"], 2) > 0
+  for path in [*(folder / "global").glob("00[12].*")]:
+    path.unlink()
+  with pytest.raises(ConfigError, match="one view shows the board, but at least 2"):
+    command.calibrate(contract, folder, out, board_on="table", overwrite=True)
   (folder / "wrist").rename(tmp_path / "wrist")
   with pytest.raises(ConfigError, match="global camera: with the board on the table"):
     command.calibrate(contract, folder, out, board_on="table", overwrite=True)
