@@ -50,8 +50,7 @@ def test_the_documents_have_the_stored_results(task):
   ((to_80, to_95, end),) = re.findall(
     rf"^\| {task}, .+ seeds \| (.+) \| (.+) \| (.+) \|", page, re.M
   )
-  # For push_plate, the page has the time of `make train` in its text.
-  assert end == solved + ("" if task == "push_plate" else f" after {minutes}")
+  assert end == f"{solved} after {minutes}"
   assert numbers(to_80) == [two_digits(float(run["min to 80 %"])) for run in runs]
   curves = [folder / f"seed_{run['seed']}.csv" for run in runs]
   assert numbers(to_95) == [two_digits(minutes_to(0.95, curve)) for curve in curves]
