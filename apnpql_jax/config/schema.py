@@ -53,8 +53,9 @@ class EnvConfig:
   """Draw the shadow of the hand on the table, a cue to the height of the hand."""
 
   static_targets: bool = codec.added(False)
-  """Primitives lead to the joint targets of the reset state, also after objects have
-  moved."""
+  """Primitives lead straight to joint angles that are found once for each reset state,
+  by play: at the object, where the object primitive comes to rest; at the goal, where
+  the expert solves the task. For ablations."""
 
   true_primitives: bool = codec.added(False)
   """Observations include the true primitives, and the prior takes them in place of the

@@ -8,6 +8,7 @@ world is reset in the same way, and counted.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -21,6 +22,7 @@ from apnpql_jax.config.checks import check_env
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.envs.cameras import Renderer, make_cameras
 from apnpql_jax.envs.state import Arrival, EnvState, where_world
+from apnpql_jax.envs.static_targets import with_static_targets
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.primitives import reset_bank, tracking
 from apnpql_jax.primitives.reset_bank import ResetBank
@@ -310,6 +312,10 @@ def make_env(
   if config.randomize:
     make_randomize(config.randomization, task.scene)
   bank, _ = reset_bank.load_bank(task, config.bank_rows, seed=bank_seed)
+  if config.static_targets:
+    tracked = dict(static_targets=False, obs="state", randomize=False)
+    plain = Env(dataclasses.replace(config, **tracked), task, bank)
+    bank = with_static_targets(bank, plain)
   return Env(config, task, bank, mesh, instants=instants, imitated=imitated)
 
 

@@ -1,0 +1,99 @@
+"""Joint targets that stay where they are, found by play (``env.static_targets``).
+
+The paper's primitives lead straight to configurations at the object, at the goal and at
+rest (Sec. IV-A and V-A). The primitives of the tasks here pass waypoints that depend on
+where the hand is, so a reset state does not tell where they end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Float, Int, PRNGKeyArray
+import numpy as np
+
+from apnpql_jax.config.schema import EnvConfig
+from apnpql_jax.console import print_line
+from apnpql_jax.envs.state import EnvState, where_world
+from apnpql_jax.primitives.reset_bank import ResetBank
+from apnpql_jax.tasks import Task
+from apnpql_jax.types import PRIMITIVES, Array
+
+AT_ONCE = 256  # worlds
+REACH_PERIODS = 40  # control periods in which the hand comes to rest at the object
+
+Policy = Callable[[EnvState], Array]
+
+
+class Worlds(Protocol):
+  """The parts of ``Env`` that are needed to play."""
+
+  config: EnvConfig
+  task: Task
+
+  def reset(self, rows: Array) -> EnvState:
+    """See ``Env``."""
+    ...
+
+  def step(self, state: EnvState, action: Array, key: PRNGKeyArray) -> EnvState:
+    """See ``Env``."""
+    ...
+
+  def expert_action(self, state: EnvState) -> Array:
+    """See ``Env``."""
+    ...
+
+
+def with_static_targets(bank: ResetBank, env: Worlds) -> ResetBank:
+  """Returns the bank with targets at the ends of the primitives.
+
+  At the object, it is where the object primitive alone comes to rest. At the goal, it
+  is where the scripted expert solves the task, or where it is when its time is over.
+  Takes a minute per thousand rows.
+
+  Args:
+    bank: Reset states.
+    env: Worlds of the bank whose primitives track the scene.
+  """
+  print_line(f"playing {bank.rows:,} episodes for the static targets")
+  reach, solve = PRIMITIVES.index("object"), PRIMITIVES.index("goal")
+
+  @jax.jit
+  def ends(rows: Int[Array, " worlds"]) -> Float[Array, "worlds 2 6"]:
+    return jnp.stack(
+      [
+        _end(
+          env, rows, lambda state: state.timestep.primitives[:, reach], REACH_PERIODS
+        ),
+        _end(env, rows, env.expert_action, env.config.episode_steps),
+      ],
+      axis=1,
+    )
+
+  starts = range(0, bank.rows, AT_ONCE)
+  last = bank.rows - 1
+  found = [ends((start + jnp.arange(AT_ONCE)).clip(max=last)) for start in starts]
+  played = jnp.concatenate(found)[: bank.rows]
+  targets = bank.targets.at[:, np.array([reach, solve])].set(played)
+  return bank.replace(targets=targets)
+
+
+def _end(
+  env: Worlds, rows: Int[Array, " worlds"], policy: Policy, periods: int
+) -> Float[Array, "worlds 6"]:
+  """Returns the joint angles (rad) at the last instant of episodes, or after a time."""
+  joints, key = env.task.scene.arm_qpos, jax.random.key(0)
+
+  def period(carry: tuple[EnvState, Array, Array]) -> tuple[EnvState, Array, Array]:
+    state, q, over = carry
+    state = env.step(state, policy(state), key)  # After the end, other episodes begin.
+    q = where_world(over, q, state.physics.qpos[:, joints])
+    over |= state.timestep.last | (state.elapsed >= periods)
+    return state, q, over
+
+  state = env.reset(rows)
+  first = state, state.physics.qpos[:, joints], jnp.zeros(len(rows), bool)
+  return jax.lax.while_loop(lambda carry: ~carry[2].all(), period, first)[1]
