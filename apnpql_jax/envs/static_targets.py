@@ -52,7 +52,7 @@ def with_static_targets(bank: ResetBank, env: Worlds) -> ResetBank:
 
   At the object, it is where the object primitive alone comes to rest. At the goal, it
   is where the scripted expert solves the task, or where it is when its time is over.
-  Takes a minute per thousand rows.
+  Plays two episodes per row, which takes minutes for thousands of rows.
 
   Args:
     bank: Reset states.
