@@ -54,8 +54,8 @@ class EnvConfig:
 
   static_targets: bool = codec.added(False)
   """Primitives lead straight to joint angles that are found once for each reset state,
-  by play: at the object, where the object primitive comes to rest; at the goal, where
-  the expert solves the task. For ablations."""
+  by play without randomization: at the object, where the object primitive comes to
+  rest; at the goal, where the expert solves the task. For ablations."""
 
   true_primitives: bool = codec.added(False)
   """Observations include the true primitives, and the prior takes them in place of the

@@ -58,7 +58,7 @@ def with_static_targets(bank: ResetBank, env: Worlds) -> ResetBank:
     bank: Reset states.
     env: Worlds of the bank whose primitives track the scene.
   """
-  print_line(f"playing {bank.rows:,} episodes for the static targets")
+  print_line(f"playing from {bank.rows:,} reset states for the static targets")
   reach, solve = PRIMITIVES.index("object"), PRIMITIVES.index("goal")
 
   @jax.jit
