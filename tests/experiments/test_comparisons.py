@@ -32,7 +32,7 @@ RUNS = [
 
 by_folder = pytest.mark.parametrize(
   "comparison",
-  [*COMPARISONS, search.COMPARISON, update_budget.COMPARISON],
+  [*COMPARISONS, *(x.COMPARISON for x in (search, ablations, update_budget))],
   ids=lambda x: x.out.name,
 )
 
