@@ -34,6 +34,7 @@ COMPARISON = pixel_comparison.variant(
   more=("prior",),
   tasks=("push_plate", "flip_cup"),
   seeds=(0, 1),
+  axes=("steps",),
 )
 
 if __name__ == "__main__":
