@@ -89,7 +89,8 @@ def _end(
 
   def period(carry: tuple[EnvState, Array, Array]) -> tuple[EnvState, Array, Array]:
     state, q, over = carry
-    state = env.step(state, policy(state), key)  # After the end, other episodes begin.
+    state = env.step(state, policy(state), key)
+    over |= state.elapsed == 0  # A broken world has begun another episode.
     q = where_world(over, q, state.physics.qpos[:, joints])
     over |= state.timestep.last | (state.elapsed >= periods)
     return state, q, over
