@@ -1,4 +1,4 @@
-"""Pytrees that cross the borders between simulation, agent and replay.
+"""Pytrees passed between simulation, agent and replay.
 
 Shapes in annotations are jaxtyping's and are not checked at run time. ``*b`` stands for
 any leading batch axes (worlds, or time and worlds); floats are float32. Time suffixes

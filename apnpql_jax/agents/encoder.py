@@ -88,8 +88,8 @@ class Encoder(nn.Module):
   dozen of the robot. The layer norm gives phi a fixed scale: heads that read phi
   without training it (prior, alpha) need not follow growing activations.
 
-  The optional LSTM reads the features of the last L instants of an episode, from an
-  empty memory both in acting and in learning. Its last output is phi.
+  The optional LSTM reads the features of the last L instants of an episode. Its state
+  starts at zero, both in acting and in learning. Its last output is phi.
   """
 
   config: AgentConfig

@@ -80,10 +80,10 @@ def mixture_size(*, own_mean: bool) -> int:
 
 
 def spread_means(num: int) -> nn.initializers.Initializer:
-  """Returns the first bias of a head with own means, which starts several apart.
+  """Returns the bias initializer of a head with its own means; several start apart.
 
-  Components that start together have nearly equal gradients, so that only noise would
-  part them.
+  Components that start together have nearly equal gradients, so only noise would
+  separate them.
   """
 
   def init(key: PRNGKeyArray, shape: tuple[int, ...], dtype: jnp.dtype) -> Array:

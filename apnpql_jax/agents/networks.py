@@ -97,7 +97,7 @@ class Heads:
   """Networks, parameters and features bound together: all predictions at ``*b`` states.
 
   Each prediction here determines which parameters it trains. Prior, policy and alpha
-  read phi without training it, because the E-step's loss has neither (paper Eq. 10).
+  read phi without training it: the E-step's loss has none of them (paper Eq. 10).
   """
 
   networks: Networks
@@ -112,7 +112,7 @@ class Heads:
     return self.networks.config
 
   def frozen(self) -> Heads:
-    """Returns heads with equal predictions and without gradients to parameters."""
+    """Returns heads with the same predictions but no gradients to parameters."""
     params, phi = jax.lax.stop_gradient((self.params, self.phi))
     return dataclasses.replace(self, params=params, phi=phi)
 

@@ -38,10 +38,10 @@ class Robot(Command):
   """Folder of an exported policy, see `apnpql export`."""
 
   cell: Annotated[Path, default_hint("(default: robot.toml)")] = Path("robot.toml")
-  """File that describes the cell, of ur5e."""
+  """File that describes the robot cell; used by ur5e only."""
 
   task: str = ""
-  """Task on the table, to refuse policies of others."""
+  """Task set up on the table; policies for other tasks are refused."""
 
   episodes: int = 10
   """Number of episodes."""
@@ -50,7 +50,7 @@ class Robot(Command):
   """Random seed of the policy and of simulated reset states."""
 
   log: File = None
-  """Folder to make, for a dataset of LeRobot with what happened."""
+  """Folder to create for the log, a LeRobot dataset of what happened."""
 
   replay: File = None
   """Repeat the actions of a log instead of those of the policy."""
@@ -62,14 +62,14 @@ class Robot(Command):
   """Delay of commands to a simulated arm."""
 
   slowdown: float = 1.0
-  """Seconds per second of a simulated robot, for busy machines."""
+  """Real seconds per simulated second; raise it on a busy machine."""
 
   yes: Flag = False
   """Move a real arm without asking."""
 
   views: Annotated[Path, default_hint("(default: views)")] = Path("views")
-  """Folder of the views of the board, for calibrate: to make, or with --recorded, to
-  read."""
+  """For calibrate: folder to write the views of the board to or, with --recorded, to
+  read them from."""
 
   recorded: Flag = False
   """Calibrate from the views that are in the folder, without devices."""
@@ -182,7 +182,7 @@ def _confirm(args: Robot) -> None:
     ConfigError: The answer is no, or nobody can answer.
   """
   if not sys.stdin or not sys.stdin.isatty():
-    raise ConfigError("a real arm would move; add --yes if nobody is asked")
+    raise ConfigError("a real arm would move; add --yes to skip the question")
   sys.stderr.write(
     f"The arm of {args.cell} will move. Keep the emergency stop at hand. Go on? [y/N] "
   )

@@ -53,9 +53,9 @@ class Env:
       reset:  rows ------- begin ----> Arrival -- observe --> EnvState
       step:   EnvState -- advance ---> Arrival -- observe --> EnvState
 
-  Most of a compiled program is ``observe``. A loop that begins with it, and carries an
-  ``Arrival``, contains it once. States from elsewhere are observed through
-  ``Arrival.after``.
+  ``observe`` is most of a compiled program. A loop that carries an ``Arrival`` and
+  begins with ``observe`` contains it only once. ``Arrival.after`` prepares states from
+  elsewhere for ``observe``.
   """
 
   def __init__(
@@ -118,7 +118,7 @@ class Env:
   ) -> Arrival:
     """Starts one world per bank row: first half of ``reset``.
 
-    A key per world draws its randomization. Without keys, a row always has the same.
+    A key per world draws its randomization. Without keys, that of a row never changes.
     """
     count = rows.shape[0]
     first = Arrival(
@@ -188,7 +188,7 @@ class Env:
   def expert_action(self, state: EnvState) -> Float[Array, "worlds 7"]:
     """Returns the actions of the task's scripted expert."""
     kinematics, primitives = self._kinematics(state.physics), state.timestep.primitives
-    if self.config.static_targets:  # They do not lead to objects that have moved.
+    if self.config.static_targets:  # Static ones do not follow a moved object.
       _, primitives = self._tracked(state.physics, kinematics, state.targets)
     return self.task.expert(state.physics, kinematics, primitives)
 

@@ -54,8 +54,8 @@ class FunctionalEnv:
 
   A step from a state that is done ignores the action and returns the first state of a
   random episode, so no wrapper for resets is needed. What wrappers add to ``metrics``
-  and ``info`` is kept. A world that becomes non-finite is done, with the observation
-  before it broke.
+  and ``info`` is kept. A world that becomes non-finite is done and keeps its last
+  finite observation.
   """
 
   action_size = ACTION_DIM
@@ -121,7 +121,7 @@ def _state(worlds: EnvState, rng: PRNGKeyArray, faults: Array | int = 0) -> Stat
 def _over_worlds(function: Callable[..., State]) -> Callable[..., State]:
   """Turns a function of [worlds, ...] into one of a world that ``vmap`` turns back.
 
-  Further axes of ``vmap`` are merged with that of worlds: C MuJoCo's call has but one.
+  Nested ``vmap`` axes are merged into the worlds axis: C MuJoCo's call has only one.
   """
   batched = custom_vmap(function)
 

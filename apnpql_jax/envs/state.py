@@ -73,7 +73,7 @@ class Arrival(struct.PyTreeNode):
     targets: Float[Array, "worlds 3 6"],
     fresh: Bool[Array, " worlds"],
   ) -> Arrival:
-    """Returns the instant after ``before``; ``targets`` count where it is ``fresh``."""
+    """Returns the instant after ``before``; ``targets`` apply where it is ``fresh``."""
     return cls(
       physics=physics,
       targets=where_world(fresh, targets, before.targets),

@@ -1,4 +1,4 @@
-"""Joint targets that stay where they are, found by play (``env.static_targets``).
+"""Joint targets that stay fixed, found by playing episodes (``env.static_targets``).
 
 The paper's primitives lead straight to configurations at the object, at the goal and at
 rest (Sec. IV-A and V-A). The primitives of the tasks here pass waypoints that depend on

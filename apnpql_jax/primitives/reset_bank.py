@@ -50,7 +50,7 @@ SETTLE_PERIODS = 4  # default control periods at rest before a draw is accepted
 SETTLED_AT_ONCE = 512  # draws; an engine keeps memory for each of its worlds
 SETTLE_SPEED = 0.05  # m/s and rad/s; above float32 contact noise (0.04)
 SETTLE_SHIFT = 0.005  # m; an object that settles further away overlapped with another
-MAX_TRAVEL = 2.5  # rad; turning further, a joint would pass through another branch
+MAX_TRAVEL = 2.5  # rad; a joint that turns further would pass through another branch
 
 
 class ResetBank(struct.PyTreeNode):
@@ -93,8 +93,8 @@ def load_bank(
 ) -> tuple[ResetBank, BankReport]:
   """Loads the task's bank from the user's cache; builds it if there is no valid one.
 
-  ``seed`` draws its states. Prints one line if the cached one cannot be used, or the
-  new one cannot be kept.
+  ``seed`` draws its states. Prints one line if the cached bank cannot be used, or the
+  new one cannot be saved.
   """
   cache = cache_dir()
   if cache is None:

@@ -41,7 +41,7 @@ def check(config: RandomizationConfig, scene: Scene) -> None:
 
 
 def scale(draw: Draw, world: World, qpos: Array) -> Array:
-  """Scales objects, separately along z; returns qpos with them where they stood."""
+  """Scales objects, separately along z; returns qpos in which they still stand."""
   if not (draw.config.size or draw.config.shape):
     return qpos
   model, objects = world.model, np.flatnonzero(free_bodies(world.model))

@@ -53,7 +53,7 @@ def texture(draw: Draw, world: World) -> None:
   phase = jax.random.uniform(phase, (count, 3, 1))[groups]
   world["waves"] = jnp.concatenate([vectors, phase], axis=-1)
 
-  # The odd squares have another color; noise only darkens, so it may by two changes.
+  # Odd squares have another color. Noise only darkens, so it may change twice as much.
   rgb = jnp.concatenate([world["geom_rgba"][:, :3], world["background"][None]])
   other = (rgb + change[groups]).clip(0.0, 1.0)
   world["odd_rgb"] = jnp.where((kind == 1)[groups][:, None], other, rgb)

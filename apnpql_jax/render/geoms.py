@@ -167,8 +167,8 @@ def _read_hull(model: mujoco.MjModel, geom_id: int) -> np.ndarray:
   if fill < LEAST_FILL:
     raise ConfigError(
       f"cannot draw mesh {_title(model, geom_id)}: it fills {fill:.0%} of its convex "
-      "hull, as which meshes are drawn. Split it into convex meshes, draw primitives "
-      'and hide it with group="3", or use --obs state'
+      "hull, and a mesh is drawn as its hull. Split it into convex meshes, draw "
+      'primitives and hide it with group="3", or use --obs state'
     )
   return planes
 

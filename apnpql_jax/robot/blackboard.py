@@ -137,8 +137,8 @@ class Record:
   def read(self) -> Any:
     """Returns a copy of the newest whole record, by field; see ``text``.
 
-    It is the last one that this reader took if the writer stays at work, or has died
-    there; zeros if there was none.
+    If the writer keeps writing, or has died while it wrote, this is the last copy that
+    the reader took, or zeros if there was none.
     """
     for _ in range(_TRIES):
       number = self._head[0]

@@ -49,7 +49,7 @@ class Control:
       board: The board.
       events: Gets (time, mode, reason) at each change.
       clock: The clock of the session.
-      watchdog_s: Time between two cycles after which a motion ends where it is.
+      watchdog_s: Longest time between two cycles; after a longer one, a motion ends.
     """
     self._arm, self._hand, self._core, self._board = arm, hand, core, board
     self._events, self._clock = events, clock or Clock()

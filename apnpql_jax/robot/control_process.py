@@ -1,7 +1,8 @@
 """The control process: 500 cycles per second between the devices and the board.
 
 It does not import JAX, so that neither a compilation nor a thread pool can delay it.
-Its end ends the policy process. It brakes when that or the main process ends.
+When it ends, so does the policy process. It brakes when the policy process or the main
+process ends.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ def main(
     board_name: Name of the board.
     options: ``admittance``: whether contacts move the virtual arm.
     events: Gets changes of the mode, and an error that ends the process, as text.
-    peer: Its other end is with the policy process alone, which may send why it ends.
+    peer: Pipe from the policy process, which alone holds the other end and may send
+      why it ends.
   """
   devices.leave_interrupts_to_the_main_process()
   # More often than every 5 ms, so that the drivers' threads do not hold up cycles.

@@ -16,7 +16,7 @@ from apnpql_jax.robot.supervisor import Action, Mode, Supervisor
 from apnpql_jax.robot.virtual_arm import Admittance, VirtualArm
 
 _LIMITED = 0.01
-"""Difference of velocities from which on the limits have changed a motion, rad/s."""
+"""Change of velocity above which the limits count as having changed it, rad/s."""
 
 _ARRIVED = 1e-4
 """Distance at which a pose is reached, rad."""
@@ -109,8 +109,8 @@ class Core:
     """Returns the command for the next 2 ms on a straight line of joints to a pose.
 
     All joints start and slow down together, so neither the acceleration nor the ranges
-    of single joints bend the line, and a hold does not either. Only an arm that lags by
-    more than ``Limits.deviation`` does; from there, another line leads to the pose.
+    of single joints bend the line, and neither does a hold. Only an arm that lags by
+    more than ``Limits.deviation`` leaves it; a new line then leads to the pose.
     """
     limiter, gap = self.limiter, target - self.limiter.position
     mode, reason = self.supervisor.judge_arm(now, state, limiter.position)

@@ -51,9 +51,9 @@ class Hand:
   def hold(self, now: float) -> None:
     """Stops the fingers where they are, but keeps a grip.
 
-    Fingers that were told to close and stand still press on an object, or on each
-    other, with their limited torque. They go on: to command their present position
-    would take away the force that carries the object. They neither open nor close.
+    Fingers that were told to close and have stopped are pressing on an object, or on
+    each other, with their limited torque. They keep pressing, because commanding their
+    present position would take away the force that carries the object.
     """
     grips = self._close and now - self._moved > _STILL_S
     if self._close is not None and not grips:

@@ -5,7 +5,7 @@ the arm is to have next. Its state always leaves a way to stop inside of the box
 next velocity is accepted only if braking from it ends inside.
 
 An arm may begin on the border, where it may have come to rest, or beyond it by its own
-error. From there it may only move inwards, as also when something has pushed it there.
+error. From there, or from where something has pushed it, it may only move inward.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ _STILL = 1e-6
 """Joint velocity below which a command stands still, rad/s."""
 
 _WAY_STEP = 0.004
-"""Distance of the poses at which a way is looked at before it begins, rad.
+"""Spacing of the poses at which a path is checked before it begins, rad.
 
-If all joints turn so much, the tool is within 0.1 mm of the chord.
+If all joints turn by this much, the tool stays within 0.1 mm of the chord.
 """
 
 _GRACE = 1e-4
-"""By how much a tool that has begun outside may move out, m, as a way may be curved."""
+"""How much farther out a tool that began outside may go, m, as its path may curve."""
 
 _EVERYWHERE = np.array([[-np.inf, np.inf]] * 3)
 

@@ -61,8 +61,8 @@ class Observer:
 def next_period(number: int, elapsed: float, period: float) -> int:
   """Returns the number of the first period to begin, counted from 0.
 
-  A late action drops the periods that have begun meanwhile. To catch up would send
-  actions in quick succession, which no training has seen.
+  A late action skips the periods that have begun in the meantime. Catching up would
+  send actions in quick succession, which never happens in training.
 
   Args:
     number: Number of the present period.

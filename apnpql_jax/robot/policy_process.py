@@ -92,8 +92,8 @@ def main(
     board_name: Name of the board.
     options: ``policy``: folder; ``seed``; ``log``: folder of a log or None; ``replay``:
       log whose actions to repeat or None.
-    peer: Its other end is with the control process alone, whose end ends this one. Gets
-      an error that ends this process, as text.
+    peer: Pipe to the control process, which alone holds the other end. If that process
+      ends, so does this one. Gets the error that ends this process, as text.
   """
   devices.leave_interrupts_to_the_main_process()
   ready, ending = threading.Event(), threading.Event()

@@ -83,7 +83,7 @@ def _play(
 ) -> str:
   """Adds an outcome for each episode; returns what has ended the session early.
 
-  The arm has moved by then, so that no failure is one of bad input any more.
+  The arm has moved by then, so a failure no longer counts as bad input.
   """
   try:
     _go_home(session)

@@ -42,7 +42,7 @@ class Sensor:
     self._offset = POWER_ON * self._error()
 
   def zero(self, wrench: np.ndarray) -> None:
-    """Takes the present ``wrench`` for none, up to an error that it draws."""
+    """Makes the present ``wrench`` read as zero, up to a random error."""
     self._offset = self._error() - wrench
 
   def drift(self, wrench: np.ndarray) -> None:
@@ -54,5 +54,5 @@ class Sensor:
     return wrench + self._offset + NOISE * self._rng.normal(size=6)
 
   def _error(self) -> np.ndarray:
-    """Returns an error of which all sizes within the accuracy are as likely."""
+    """Returns an error drawn uniformly from within the accuracy."""
     return np.repeat([FORCE_ACCURACY, TORQUE_ACCURACY], 3) * self._rng.uniform(-1, 1, 6)

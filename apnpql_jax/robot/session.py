@@ -225,8 +225,8 @@ class Session(contextlib.AbstractContextManager):
     """Waits for the end of an episode.
 
     Returns:
-      Why it ended before its time, empty if it did not; and false if that was not in
-      the episode itself, but a signal or a failure.
+      Why it ended early, or an empty string; and whether the episode itself ended,
+      rather than a signal or a failure ending it.
     """
 
     def over() -> bool:

@@ -27,10 +27,10 @@ RELIEF_S = 0.2
 """Time for which the force must be small again before a hold ends."""
 
 JAM_S = 1.0
-"""Time for which a hold of its force may last."""
+"""How long a hold because of a force may last before it becomes a stop."""
 
 RUNAWAY = 1.2
-"""Ratio of the distance between command and arm to its limit that ends the motion."""
+"""Multiple of ``Limits.deviation``; an arm farther from its command is stopped."""
 
 
 class Mode(enum.IntEnum):

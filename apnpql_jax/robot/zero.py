@@ -54,7 +54,7 @@ class Zero:
     return len(self._readings) == _READINGS
 
   def check(self) -> str:
-    """Keeps what the hand reads at home; returns why it cannot be right and free."""
+    """Stores the reading at home; returns why it cannot be that of a free hand."""
     self.unloaded = np.mean(self._readings, axis=0)
     return self._refusal()
 
@@ -83,6 +83,6 @@ class Zero:
     force, torque = np.linalg.norm(mean.reshape(2, 3), axis=1)
     return (
       f"the arm reads {force:.0f} N and {torque:.1f} N m at rest: free the hand; if it "
-      "is free, start again, as the sensor has drifted, or check the payload in "
-      "robot.toml"
+      "is free, the sensor has drifted: start again; if that does not help, check the "
+      "payload in robot.toml"
     )

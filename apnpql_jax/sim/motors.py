@@ -41,8 +41,8 @@ def gripper_torque(
 
   C MuJoCo and MJX integrate the saturated force of a MuJoCo velocity actuator
   differently, so this is an explicit servo: from the finger's angle (rad, 0 = open) and
-  velocity (rad/s) to N m, positive closes. A ``close`` of 1 closes, 0 opens; others are
-  clipped to between them. ``speed`` is that of the pad gap, m/s.
+  velocity (rad/s) to N m, positive closes. A ``close`` of 1 closes, 0 opens; other
+  values are clipped to [0, 1]. ``speed`` is that of the pad gap, m/s.
   """
   desired = finger_rate(angle, close, xp, speed=speed)
   return (GRIPPER_GAIN * (desired - velocity)).clip(-GRIPPER_TORQUE, GRIPPER_TORQUE)

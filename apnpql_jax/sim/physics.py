@@ -50,7 +50,7 @@ class Physics(Protocol):
     """Advances every world by one control period.
 
     The desired joint velocities [worlds, 6] are in rad/s; a ``close`` [worlds] of 1
-    closes the gripper, 0 opens it; others are clipped to between them.
+    closes the gripper, 0 opens it; other values are clipped to [0, 1].
     """
     ...
 

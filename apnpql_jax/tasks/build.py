@@ -1,7 +1,7 @@
 """Building a task by its name, and checking that it follows the protocol ``Task``.
 
-A method that returns another shape would fail deep in a compiled program, or drive the
-wrong joint without a word.
+A method that returns a wrong shape would fail deep in a compiled program, or silently
+drive the wrong joint.
 """
 
 from __future__ import annotations
@@ -57,8 +57,8 @@ def _check_file(name: str, kind: type[Task]) -> None:
     inspect.getfile(kind)
   except (OSError, TypeError):
     raise ConfigError(
-      f"the class of task {name!r} is not in a file, but in a notebook or at a prompt: "
-      "write it to a Python file and load that, as load_preset does with its path"
+      f"the class of task {name!r} is not in a file, but in a notebook or at a prompt; "
+      "save it in a Python file, and pass the path of that file to load_preset"
     ) from None
 
 

@@ -35,7 +35,7 @@ class Pinch:
   """A grip between the pads on something of known width, by a vertical tool.
 
   Raises:
-    ConfigError: Something so narrow or so wide cannot be told from closed or open pads.
+    ConfigError: At this width, a grip looks like closed or open pads.
   """
 
   scene: Scene
@@ -86,8 +86,8 @@ class Pinch:
   ) -> Point:
     """Returns the tool position (m) that leads to a grip at ``aim`` and hits nothing.
 
-    A low tool rises first; over the object it descends through a funnel, but not with
-    fingers that are closed on nothing; around the object it stays.
+    A low tool rises first. Over the object it descends through a funnel, unless the
+    fingers are closed on nothing. Once around the object, it stays.
     """
     tool = kinematics.site_xpos[:, self.scene.tool_site]
     off = geometry.norm(tool[:, :2] - aim[:, :2]) + off_by(twist, self.straight)

@@ -198,7 +198,7 @@ def summarize(instants: Instants, config: AgentConfig) -> dict[str, Any]:
 
 
 def end_of(stages: Array | np.ndarray) -> str:
-  """Names the last stage of an episode, and the farthest one if it had come farther.
+  """Names the last stage of an episode, and the farthest one if that is another.
 
   ``stages`` i32[time] are those of its instants.
   """

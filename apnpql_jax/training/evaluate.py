@@ -109,8 +109,8 @@ def evaluate(
     step: Step of the checkpoint; the newest if None.
     acting: Rule that chooses actions, see ``agents/acting.py``; that of the run's
       evaluations if None.
-    bank_seed: Seed of the reset states. Those of the default were used by evaluations
-      during training; any other draws new ones, as many as there are episodes.
+    bank_seed: Seed of the reset states. Evaluations during training used those of the
+      default seed. Any other seed draws new states, as many as there are episodes.
     video: File for a video of the first episodes; failures to write are only printed.
 
   Returns:
@@ -170,7 +170,7 @@ def load_trained(
     FileError: Not a run folder, or no readable checkpoint.
   """
   if not 0 <= bank_seed < 2**31:
-    raise ConfigError(f"bank_seed={bank_seed} must be within 0 and 2**31 - 1")
+    raise ConfigError(f"bank_seed={bank_seed} must be from 0 to 2**31 - 1")
   run_dir = Path(run_dir)
   config = run_folder.open_run(run_dir).config
   env_config = dataclasses.replace(config.env, backend=backend or config.env.backend)
@@ -245,7 +245,7 @@ def check_count(episodes: int, seed: int) -> None:
   if episodes < 1:
     raise ConfigError(f"episodes={episodes} must be at least 1")
   if not 0 <= seed < 2**31:
-    raise ConfigError(f"seed={seed} must be within 0 and 2**31 - 1")
+    raise ConfigError(f"seed={seed} must be from 0 to 2**31 - 1")
 
 
 def _check(episodes: int, seed: int, video: Path | str | None) -> Path | None:

@@ -132,9 +132,9 @@ def _columns(
 ) -> tuple[np.ndarray, np.ndarray]:
   """Returns which instants the columns hold, and where episodes end, [length, worlds].
 
-  A column begins where an episode does, since only there its time and the targets of
-  its primitives are known: with the episode that the column before cut off, or with the
-  next one if a column is shorter than an episode.
+  A column begins where an episode does, because only there are the episode's time and
+  the targets of its primitives known. It begins with the episode that the column before
+  cut off, or with the next one if a column is shorter than an episode.
   """
   begin, last = np.flatnonzero(first), np.append(first[1:], True)
   episode, columns = 0, []

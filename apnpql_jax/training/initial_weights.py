@@ -1,6 +1,6 @@
 """Weights of another run with which a new run starts.
 
-They are kept in the folder of the new run, which needs the other one no more.
+The folder of the new run keeps a copy, so it no longer needs the other run.
 """
 
 from __future__ import annotations

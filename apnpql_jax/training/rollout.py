@@ -92,7 +92,7 @@ def example_slot(worlds: EnvState) -> Slot:
 def add_chunk(ring: Replay, before: EnvState, after: EnvState, chunk: Slot) -> Replay:
   """Adds a chunk [time, worlds, ...] to a replay.
 
-  In worlds that became non-finite, excludes it and the episode before from sampling.
+  If a world became non-finite, its chunk and the episode before are never sampled.
   """
   steps = before.elapsed + chunk.action.shape[0]
   broken = after.faults > before.faults

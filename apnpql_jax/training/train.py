@@ -91,9 +91,9 @@ def train(
     init_from: ``RUN``, ``RUN:STEP`` or ``RUN:best``: another run with whose weights
       this one starts. Optimizers and replay start empty.
     mesh: Devices to train on; the default device if None.
-    handle_signals: Save and stop at SIGINT, SIGTERM or SIGHUP. The process ends at
-      once if there is nothing to save yet, and at a second signal. Python allows this
-      in the main thread only. By default, Ctrl-C raises ``KeyboardInterrupt`` as usual.
+    handle_signals: Save and stop at SIGINT, SIGTERM or SIGHUP. A second signal, or one
+      before there is anything to save, ends the process at once. Works in the main
+      thread only. By default, Ctrl-C raises ``KeyboardInterrupt`` as usual.
 
   Returns:
     The run folder, steps, updates and the last evaluation.
@@ -314,8 +314,8 @@ def _loop(config, start, iteration, reporter, saver, signals) -> TrainState:
     skipped_updates.check(config, state, start.path)
     done = step >= config.total_steps
     rate = None
-    # Check for signals first, so that saving does not wait for an evaluation, unless no
-    # resume would make up for it.
+    # Check for signals first, so that saving does not wait for an evaluation. The last
+    # evaluation always runs, because no resume would make up for it.
     stop = devices.any_process(signals.caught)
     if done or not stop and _passed(before, step, config.eval_every):
       rate = reporter.evaluate(step, state, last=done) if reporter else None

@@ -42,7 +42,7 @@ class Writer:
     """Makes the folder and writes an empty dataset.
 
     Args:
-      folder: Folder to make, which must not exist or be empty.
+      folder: Folder to make. It must be empty if it exists.
       fps: Frames per second.
       vectors: Column of numbers -> their names, such as "action".
       images: Column of images -> height and width, such as "observation.images.wrist".
@@ -53,7 +53,7 @@ class Writer:
 
     Raises:
       ConfigError: pyarrow is missing.
-      FileError: The folder exists, or cannot be written.
+      FileError: The folder is not empty, or cannot be written.
     """
     layout.check_available()
     self.folder = Path(folder)
@@ -128,8 +128,8 @@ class Writer:
 
     Raises:
       FileError: It cannot be written.
-      ValueError: It has no frames, or a success in a dataset without, or none in one
-        with successes.
+      ValueError: The episode has no frames, or ``success`` is given although ``judged``
+        is False, or is missing although it is True.
     """
     if not self._rows:
       raise ValueError("an episode needs a frame")

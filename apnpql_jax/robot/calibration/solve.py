@@ -21,7 +21,7 @@ from apnpql_jax.robot.calibration.problem import (
 FEWEST_VIEWS = 8
 LEAST_TURN_DEG = 10.0
 """How far the flange must turn about a second axis (root mean square over all pairs of
-views): from turns about one axis, the position along it does not follow."""
+views): turns about a single axis leave the position along it undetermined."""
 
 OUTLIER_MRAD = 3.0  # a view's error above this, seen from the camera, and
 OUTLIER_FACTOR = 4.0  # above this many times the median, is an outlier's

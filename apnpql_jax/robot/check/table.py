@@ -38,7 +38,7 @@ class Table:
       self.fail(name, one_line(error))
 
   def guarded(self, name: str, read: Callable[[], T], instead: T) -> Callable[[], T]:
-    """Returns ``read``; if it fails, so does the row, and there is ``instead``."""
+    """Wraps ``read``: if it fails, the row fails and ``instead`` is returned."""
 
     def call() -> T:
       with self.row(name):

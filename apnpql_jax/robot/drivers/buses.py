@@ -10,9 +10,10 @@ At 57,600 baud, a reading of four bytes takes 5.5 ms on the line: 29 bytes, and 
 unless its latency timer is set lower. So an answer arrives within 22 ms. Both buses
 wait about 37 ms for it and try three times: a silent line is an error within 0.12 s.
 
-Answers do not name their requests. So the late answer to a first attempt passes for
-that to the second one, whose own is still to come. Both buses wait for it and discard
-it, lest the next request, of another address, gets it.
+Answers do not say which request they belong to. So a late answer to a first attempt
+passes for the answer to the second, which is still to come. Both buses wait for that
+one and discard it; otherwise it would pass for the answer to the next request, which
+reads another address.
 """
 
 from __future__ import annotations

@@ -228,7 +228,7 @@ class RealSense:
   def _captured(self, frame: Any) -> float:
     """Returns when a frame was captured by the clock ``time.monotonic``, s.
 
-    A clock of the camera itself does not help; then the kernel's time of arrival does.
+    If the time is by the camera's own clock, the kernel's time of arrival is used.
     """
     rs = self._rs
     since_epoch = frame.get_timestamp()

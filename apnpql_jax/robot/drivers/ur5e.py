@@ -87,7 +87,7 @@ class UR5e:
       self._control = self._within(
         control.RTDEControlInterface, self._host, 1 / TIMESTEP
       )
-      # Its destructor ends the process if the connection is lost: it never runs.
+      # Never destroyed: its destructor ends the process if the connection is lost.
       ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._control))
     except DeviceError:
       self.disconnect()
@@ -183,7 +183,7 @@ class UR5e:
     return self._open().fault(following=self._following)
 
   def _restart(self) -> None:
-    """Sends the program again, which would obey the last command of the registers."""
+    """Clears the last command, which the program would obey, and sends it again."""
     self._within(self._control.kickWatchdog)  # Clears the command.
     self._command("restart of the program", self._control.reuploadScript)
     end = time.monotonic() + _PATIENCE

@@ -1,7 +1,7 @@
 """Whether a UR5e answers at an address, before ``ur_rtde`` connects to it.
 
-The clients of ``ur_rtde`` wait without end for a server that accepts a connection and
-then does not speak RTDE.
+The clients of ``ur_rtde`` wait forever for a server that accepts a connection but does
+not speak RTDE.
 """
 
 from __future__ import annotations

@@ -77,7 +77,7 @@ class Reports:
     """Returns why the arm does not follow commands.
 
     Args:
-      following: Whether a program must run for that.
+      following: Whether it should follow now, so that no program is a fault, too.
     """
     source = self._source
     silence = self._clock.silence(source.getTimestamp())
@@ -142,7 +142,7 @@ class ControllerClock:
     return stamp + self._offset
 
   def silence(self, stamp: float) -> float:
-    """Returns how long this is the newest stamp, s."""
+    """Returns how long ``stamp`` has been the newest one, s."""
     now = time.monotonic()
     if stamp != self._last:
       drift = self._DRIFT * (now - self._arrival)
