@@ -249,6 +249,11 @@ def _check_expert(config: TrainConfig) -> None:
       "replay.expert_steps=0 leaves no room for replay.demonstrations="
       f"{replay.demonstrations}"
     )
+  if replay.demonstrations and config.env.static_targets:
+    raise ConfigError(
+      "env.static_targets are ends of the scripted expert's episodes, which "
+      f"replay.demonstrations={replay.demonstrations} does not have; use one of them"
+    )
 
 
 def _check_replay(config: TrainConfig, memory_bytes: int | None) -> None:

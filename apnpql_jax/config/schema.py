@@ -53,9 +53,10 @@ class EnvConfig:
   """Draw the shadow of the hand on the table, a cue to the height of the hand."""
 
   static_targets: bool = codec.added(False)
-  """Primitives lead straight to joint angles that are found once for each reset state,
-  by play without randomization: at the object, where the object primitive comes to
-  rest; at the goal, where the expert solves the task. For ablations."""
+  """Primitives lead straight to joint angles that stay fixed: at the object, where the
+  object primitive comes to rest; at the goal, where the expert releases the object, or
+  solves the task. Each start finds them by playing two episodes per reset state without
+  randomization, which takes minutes. For ablations."""
 
   true_primitives: bool = codec.added(False)
   """Observations include the true primitives, and the prior takes them in place of the
