@@ -210,7 +210,7 @@ def list_names(args: List) -> Json:
     for name in tasks.registered_by(module.__name__):
       tasks.make_task(name)
   if args.contacts:
-    from apnpql_jax.envs.contact_report import contact_report
+    from apnpql_jax.tasks.contact_report import contact_report
 
     return {name: contact_report(tasks.make_task(name)) for name in names}
   return {
