@@ -239,11 +239,11 @@ def total_loss(
   config = networks.config
   # Evaluate the networks at s_tm1.
   heads = networks.at(trained, batch.observation_tm1)
-  slow = networks.at(target_params, batch.observation_tm1)
+  target_heads = networks.at(target_params, batch.observation_tm1)
   predicted, label = heads.primitives(), batch.primitives_tm1
   outputs = heads.z(batch.action_tm1[None])[0]
   # Improve the policy, and compute the losses of all columns of Table I.
-  prior = algorithm.regularizer(heads, slow)
+  prior = algorithm.regularizer(heads, target_heads)
   improved = algorithm.policy_update(heads, prior, key)
   candidates = improved.candidates
   q_values, weights = candidates.q_values, improved.weights
