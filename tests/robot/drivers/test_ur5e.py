@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator
 import contextlib
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from apnpql_jax.robot import doubles
 from apnpql_jax.robot.doubles.controller import SERIAL, VERSION
 from apnpql_jax.robot.doubles.plant import DRIFT
 from apnpql_jax.robot.doubles.server import ask
-from apnpql_jax.robot.drivers.ur5e import UR5e
+from apnpql_jax.robot.drivers.ur5e import WATCHDOG, UR5e
 from apnpql_jax.robot.limits import TIMESTEP
 
 pytest.importorskip("rtde_control", reason="needs ur_rtde")
@@ -157,6 +158,54 @@ def test_each_fault_is_one_line_in_time(rig, cause, text):
     rig.arm.send_action(start)
   assert "\n" not in str(error.value)
   rig.arm.stop()  # Harmless.
+
+
+CLIENT = """
+import sys, time
+from apnpql_jax.robot.drivers.ur5e import UR5e
+arm = UR5e(sys.argv[1], payload_kg=0.5, payload_cog_m=[0, 0, 0.05])
+arm.connect()
+arm.start()
+position = arm.get_observation().position
+while True:
+  position = position + [0.001, 0, 0, 0, 0, 0]
+  arm.send_action(position)
+  time.sleep(0.002)
+"""
+
+
+def test_the_watchdog_stops_the_arm_of_a_client_that_hangs():
+  server = doubles.serve("push_plate", noise=False)
+  host, _ = server.greeting
+  begin = ask(host, "state")["position"][0]
+  with subprocess.Popen([sys.executable, "-c", CLIENT, host]) as client:
+    end = time.monotonic() + 30
+    while ask(host, "state")["position"][0] < begin + 0.1:
+      assert client.poll() is None and time.monotonic() < end
+    client.send_signal(signal.SIGSTOP)
+    end = time.monotonic() + 3 / WATCHDOG
+    while (state := ask(host, "state"))["program_runs"]:
+      assert time.monotonic() < end
+    time.sleep(0.5)  # It brakes.
+    rest = ask(host, "state")["position"]
+    time.sleep(0.3)
+    np.testing.assert_allclose(ask(host, "state")["position"], rest, atol=1e-4)
+    assert rest[0] < state["position"][0] + 0.2
+    client.kill()
+  server.close()
+
+
+def test_the_program_goes_on_at_rest_while_the_arm_is_read(rig):
+  rig.arm.stop()
+  end = time.monotonic() + 3 / WATCHDOG
+  while time.monotonic() < end:
+    rig.arm.get_observation()
+    time.sleep(TIMESTEP)
+  assert rig.state()["program_runs"]
+  time.sleep(2 / WATCHDOG)  # Nobody reads.
+  assert not rig.state()["program_runs"]
+  rig.arm.start()
+  assert rig.state()["program_runs"] and rig.state()["programs"] == 2
 
 
 def test_a_lost_connection_does_not_end_the_process():
