@@ -131,7 +131,20 @@ def test_the_page_shows_the_example():
     ("[0.25, -0.35, 0.005]", "[0.9, 0, 0]", "low_m must be below"),
     ("210987654321", "123456789012", "are the same camera"),
     ("[arm]", "[arm", "cannot be read"),
-    ("[gripper]", "[limits]\njoint_velocity_rad_per_s = 2\n[gripper]", "be 0.1 to 1"),
+    *(
+      (
+        "[gripper]",
+        f"[{table}]\n{key} = {value}\n[gripper]",
+        f"{table}.{key} = .*{text}",
+      )
+      for table, key, value, text in (
+        ("limits", "joint_velocity_rad_per_s", 2, "must be 0.1 to 1"),
+        ("admittance", "contact_stiffness_n_per_m", 10, "must be 5000 to 50000"),
+        ("admittance", "contact_stiffness_n_per_m", 1e6, "must be 5000 to 50000"),
+        ("admittance", "lag_s", 0.001, "must be 0.03 to 0.1"),
+        ("admittance", "lag_s", 45, "must be 0.03 to 0.1"),  # Milliseconds.
+      )
+    ),
   ],
 )
 def test_bad_cells_name_the_key_and_the_cure(tmp_path, old, new, message):
