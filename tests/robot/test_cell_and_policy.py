@@ -15,6 +15,7 @@ from apnpql_jax.cli.main import main
 from apnpql_jax.deploy.export import VERSION
 from apnpql_jax.errors import ConfigError, DeviceError, FileError
 from apnpql_jax.robot import cell, devices, policy_folder
+from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.limits import MotionLimiter
 from apnpql_jax.testing import ROOT
 
@@ -116,6 +117,12 @@ def test_a_cell_may_slow_the_arm(tmp_path):
 def test_the_page_shows_the_example():
   page = (ROOT / "docs" / "robot.md").read_text(encoding="utf-8")
   assert f"```toml\n{cell.EXAMPLE}```" in page
+
+
+def test_the_frame_of_the_workspace_is_that_of_the_pages():
+  """World x is Base y, world y is minus Base x; test_robot.py has the DH base."""
+  x, y, z = base = np.array([0.3, -0.4, 0.2])
+  np.testing.assert_allclose(ArmModel().base_mat @ base, [y, -x, z], atol=1e-7)
 
 
 @pytest.mark.parametrize(
