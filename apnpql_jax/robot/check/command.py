@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from apnpql_jax.robot import policy_process, setup
+from apnpql_jax.robot import policy_process, priority, setup
 from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.check import devices, program
 from apnpql_jax.robot.check.table import Table
@@ -35,6 +35,8 @@ def check(
     "cell": str(robot.cell.path or f"that of the {robot.kind} robot"),
     "calibration": str(robot.cell.calibration or "none needed"),
   }
+  if robot.kind == "ur5e":
+    table.rows["priority"] = _priority()
   with table.row("calibration"):
     setup.check_calibration(robot)
   act = program.rest
@@ -54,6 +56,12 @@ def check(
       devices.ages(table, robot, ages)
   table.rows["admittance"] = _contacts(policy, robot) if admittance else "off"
   return table.result()
+
+
+def _priority() -> str:
+  if priority.is_granted():
+    return "real-time, of the control process"
+  return "not real-time: set a limit rtprio, see docs/robot_first_run.md"
 
 
 def _contacts(policy: PolicyFolder, robot: Robot) -> str:
