@@ -184,6 +184,9 @@ class Controller:
       self._patience = 1 / self._doubles(1)[0]
     elif command == _PROTECTIVE_STOP:
       self.protective_stop()
+    else:  # Not without notice: the double lacks what it would do.
+      self.stop_program()
+      return True
     self._answer = _DONE
     return True
 

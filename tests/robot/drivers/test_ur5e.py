@@ -208,6 +208,11 @@ def test_the_program_goes_on_at_rest_while_the_arm_is_read(rig):
   assert rig.state()["program_runs"] and rig.state()["programs"] == 2
 
 
+def test_a_command_that_the_double_lacks_ends_the_program(rig):
+  assert not rig.arm._control.setTcp([0.0] * 6)
+  assert not rig.state()["program_runs"]
+
+
 def test_a_lost_connection_does_not_end_the_process():
   code = """
 import gc, time
