@@ -15,6 +15,12 @@ from apnpql_jax.errors import ConfigError, check_name
 AsDefault = Annotated[str | None, default_hint("")]
 ACTIONS = ("check", "calibrate", "run")
 
+_OPTIONS = {
+  "calibrate": ("views", "recorded", "board", "print_board", "board_on", "overwrite"),
+  "run": ("episodes", "seed", "log", "replay", "latency_ms", "yes"),
+}
+"""Options that only one action takes."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Robot(Command):
@@ -166,7 +172,12 @@ def _calibrate(args: Robot, opened: Any) -> dict[str, Any]:
 
 
 def _check_options(args: Robot) -> None:
-  """Raises ``ConfigError`` for values that no robot takes."""
+  """Raises ``ConfigError`` for values that no robot takes, or another action does."""
+  defaults = Robot()
+  for action, names in _OPTIONS.items():
+    for name in names:
+      if action != args.action and getattr(args, name) != getattr(defaults, name):
+        raise ConfigError(f"--{name.replace('_', '-')} is for robot {action}")
   if args.episodes < 1 or not 0 <= args.seed < 2**32:
     raise ConfigError("--episodes must be at least 1 and --seed from 0 to 2^32 - 1")
   if not 0 <= args.latency_ms <= 500 or not 0.1 <= args.slowdown <= 100:

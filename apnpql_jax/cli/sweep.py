@@ -135,7 +135,9 @@ def _open(args: Sweep, stack: contextlib.ExitStack) -> Manifest:
     return states.load(args.resume)
   if not args.presets:
     names = ", ".join(files.preset_names())
-    raise ConfigError(f"sweep needs a preset; choose from {names}")
+    raise ConfigError(
+      f"sweep needs a preset, before the options of train; choose from {names}"
+    )
   plan = make_plan(args.presets, args.grid, seeds=args.seeds, options=args.train)
   check_plan(plan)
   folder = args.out or states.find_equal(_ROOT, plan)

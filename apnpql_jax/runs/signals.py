@@ -39,14 +39,15 @@ class Signals:
   def __init__(self, message: str):
     """Sets the line that is printed when a signal ends the process."""
     self.caught: list[int] = []
-    self._message, self._patient = message, False
+    self._first: str | None = None
+    self._message = message
 
-  def finish_first(self, message: str) -> None:
-    """Lets the first signal only set ``caught``.
+  def finish_first(self, first: str, second: str) -> None:
+    """Lets the first signal only set ``caught`` and print ``first``.
 
-    The second one prints ``message`` and ends the process.
+    The second one prints ``second`` and ends the process.
     """
-    self._message, self._patient = message, True
+    self._first, self._message = first, second
 
   def __enter__(self) -> Signals:
     self._woken, self._wake = os.pipe()
@@ -75,11 +76,11 @@ class Signals:
       if byte[0] not in self._before:
         continue
       now = time.monotonic()
-      if not self._patient or first is not None and now - first > _ONE_REQUEST_S:
+      if self._first is None or first is not None and now - first > _ONE_REQUEST_S:
         self._end(byte[0])
-      if first is None:
+      elif first is None:
         first = now
-        _write("finishing this iteration, then saving; once more to stop at once")
+        _write(f"{self._first}; once more to stop at once")
     os.close(self._woken)
 
   def _end(self, number: int) -> None:
