@@ -212,7 +212,6 @@ def _calibrate_one(
     solution = solve.solve_fixed(problem, tables[0].solution.board)
   about = {
     "lens_from": source,
-    "method": solution.method,
     "residuals": solution.residuals
     | {"outliers": [shown.names[rows[i]] for i in solution.residuals["outliers"]]},
   }
