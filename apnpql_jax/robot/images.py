@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from apnpql_jax.errors import DeviceError
-from apnpql_jax.robot.drivers import vendor
+from apnpql_jax.robot.vendors import vendor
 
 Json = dict[str, Any]
 
