@@ -21,3 +21,8 @@ def vendor(module: str, package: str) -> Any:
     raise DeviceError(
       f"robot needs {package}{lacks}: pip install 'apnpql-jax[robot]'"
     ) from error
+
+
+def opencv() -> Any:
+  """Returns OpenCV; see ``vendor``."""
+  return vendor("cv2", "opencv-contrib-python-headless")

@@ -202,7 +202,7 @@ def test_the_closed_form_is_that_of_opencv(wrist):
   """From views with noise, for which each solver finds another pose."""
   cv2 = pytest.importorskip("cv2")
   if not hasattr(cv2, "calibrateHandEye"):
-    pytest.skip("this OpenCV has no such solver")
+    pytest.skip("the wheels of OpenCV 5 have no such solver")
   case = problem(wrist, on_tool=False)
   poses = np.stack([case.lens.board_pose(BOARD, x) for x in case.seen])
   hands = np.linalg.inv(case.motion)
