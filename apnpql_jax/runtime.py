@@ -33,10 +33,10 @@ _UNSUPPORTED = {
 MIN_THREADS = 4  # XLA:CPU threads per emulated device, which share a pool
 # Operations that XLA:CPU runs in the library YNNPACK; its default adds "REDUCE".
 KEPT_FUSIONS = "INDIVIDUAL_CONVOLUTION", "INDIVIDUAL_DOT"
-# The flag and the jaxlib versions that have it; XLA aborts on unknown flags.
-_JAX_DEFAULTS = None, 1.0  # of the settings below
+_JAX_DEFAULTS = None, 1.0  # of the settings in ``configure``
 _MEMINFO = Path("/proc/meminfo")
 _CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
+# The flag and the jaxlib versions that have it; XLA aborts on unknown flags.
 _FLAG, _FLAG_VERSIONS = "xla_cpu_experimental_ynn_fusion_type", r"0\.1[01]\."
 
 

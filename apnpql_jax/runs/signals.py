@@ -1,7 +1,8 @@
 """Signals that stop a run: when to finish and save, and when to end at once.
 
-Python runs signal handlers between two instructions, and a compilation or a save is one
-that takes minutes. A thread therefore watches for signals that end the process at once.
+Python runs signal handlers only between bytecode instructions, and a compilation or a
+save is one instruction that takes minutes. A thread therefore watches for the signals
+that end the process at once.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from typing import Any
 from apnpql_jax.errors import INTERRUPTED
 
 EMPTY_FOLDERS: set[Path] = set()
-"""Folders that a process which is ended at once removes, those that are empty."""
+"""Folders to remove, if they are empty, when a signal ends the process at once."""
 
 _ONE_REQUEST_S = 1.0
 """Signals closer than this are one: `timeout` and batch systems send it twice."""
@@ -31,8 +32,8 @@ class Signals:
   Enter it in the main thread. A closed terminal sends SIGHUP. Where that is ignored, as
   under ``nohup``, it stays so.
 
-  A signal ends the process at once, with a line and exit code ``INTERRUPTED`` plus its
-  number, unless ``finish_first`` was called and it is the first.
+  A signal prints a line and ends the process at once, with exit code ``INTERRUPTED``
+  plus its number. After ``finish_first``, the first signal only sets ``caught``.
   """
 
   def __init__(self, message: str):
