@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from pathlib import Path
 import sys
@@ -157,18 +158,24 @@ def _calibrate(args: Robot, opened: Any) -> dict[str, Any]:
   if (out := opened.cell.calibration) is None:
     raise ConfigError("only the cameras of --robot ur5e need a calibration")
   from apnpql_jax.robot.calibration import boards, live
+  from apnpql_jax.robot.calibration.command import calibrate
 
-  return live.calibrate_cell(
-    opened.contract,
-    args.views,
-    out,
-    host=opened.cell.arm_host,
-    serials=opened.cell.cameras,
-    recorded=args.recorded,
-    board=boards.Board().text if args.board is None else args.board,
-    board_on=args.board_on,
-    overwrite=args.overwrite,
-  )
+  contract, serials = opened.contract, opened.cell.cameras
+  devices = contextlib.nullcontext((None, None))
+  if not args.recorded:
+    devices = live.opened(contract, opened.cell.arm_host, serials)
+  with devices as (arm, cameras):
+    return calibrate(
+      contract,
+      args.views,
+      out,
+      board=boards.Board().text if args.board is None else args.board,
+      board_on=args.board_on,
+      arm=arm,
+      cameras=cameras,
+      serials=serials,
+      overwrite=args.overwrite,
+    )
 
 
 def _check_options(args: Robot) -> None:
