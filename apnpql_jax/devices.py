@@ -63,7 +63,7 @@ def make_mesh(devices: int) -> Mesh | None:
   """
   found = start()
   if not 0 <= devices <= len(found):
-    raise ConfigError(f"--devices {devices} must be within 0 (all) and {len(found)}")
+    raise ConfigError(f"--devices {devices} must be from 0 (all) to {len(found)}")
   chosen = found[: devices or None]
   return Mesh(np.array(chosen), (AXIS,)) if len(chosen) > 1 else None
 

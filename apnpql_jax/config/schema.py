@@ -53,9 +53,10 @@ class EnvConfig:
   """Draw the shadow of the hand on the table, a cue to the height of the hand."""
 
   static_targets: bool = codec.added(False)
-  """Primitives lead straight to joint angles that are found once for each reset state,
-  by play without randomization: at the object, where the object primitive comes to
-  rest; at the goal, where the expert solves the task. For ablations."""
+  """Primitives lead straight to joint angles that stay fixed: at the object, where the
+  object primitive comes to rest; at the goal, where the expert releases the object, or
+  solves the task. Each start finds them by playing two episodes per reset state without
+  randomization, which takes minutes. For ablations."""
 
   true_primitives: bool = codec.added(False)
   """Observations include the true primitives, and the prior takes them in place of the
@@ -269,7 +270,7 @@ class ReplayConfig:
   """File of demonstrations (docs/demonstrations.md) instead of the scripted expert."""
 
   allow_unsolved: bool = codec.added(False, before=True)
-  """Whether to train on demonstrations of which no episode is solved."""
+  """Whether to train on demonstrations even if no episode in them is solved."""
 
   expert_noise: float = 0.03
   """Standard deviation of the noise on the expert's joint velocities (rad/s); at 0.1
@@ -325,7 +326,7 @@ class TrainConfig:
   """Stop the run after this many consecutive non-finite (skipped) updates."""
 
   video: bool = True
-  """Write a video of evaluation episodes."""
+  """Write a video of the first episodes of the last evaluation."""
 
   sinks: tuple[str, ...] = ()
   """Additional outputs of the metrics: tensorboard, wandb."""

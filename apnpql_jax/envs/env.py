@@ -187,10 +187,15 @@ class Env:
 
   def expert_action(self, state: EnvState) -> Float[Array, "worlds 7"]:
     """Returns the actions of the task's scripted expert."""
-    kinematics, primitives = self._kinematics(state.physics), state.timestep.primitives
-    if self.config.static_targets:  # Static ones do not follow a moved object.
-      _, primitives = self._tracked(state.physics, kinematics, state.targets)
-    return self.task.expert(state.physics, kinematics, primitives)
+    kinematics = self._kinematics(state.physics)
+    return self.task.expert(state.physics, kinematics, self.moving_primitives(state))
+
+  def moving_primitives(self, state: EnvState) -> Float[Array, "worlds 3 7"]:
+    """Returns the primitives that follow the scene, even with static targets."""
+    if not self.config.static_targets:
+      return state.timestep.primitives
+    kinematics = self._kinematics(state.physics)
+    return self._tracked(state.physics, kinematics, state.targets)[1]
 
   def view(
     self, renderer: Renderer, state: PhysicsState

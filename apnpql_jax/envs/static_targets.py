@@ -20,12 +20,13 @@ from apnpql_jax.console import print_line
 from apnpql_jax.envs.state import EnvState, where_world
 from apnpql_jax.primitives.reset_bank import ResetBank
 from apnpql_jax.tasks import Task
-from apnpql_jax.types import PRIMITIVES, Array
+from apnpql_jax.types import ARM_DOF, PRIMITIVES, Array
 
 AT_ONCE = 256  # worlds
 REACH_PERIODS = 40  # control periods in which the hand comes to rest at the object
 
-Policy = Callable[[EnvState], Array]
+Policy = Callable[[EnvState], tuple[Array, Array]]
+"""State -> actions f32[worlds, 7], and whether they count bool[worlds]."""
 
 
 class Worlds(Protocol):
@@ -51,8 +52,9 @@ def with_static_targets(bank: ResetBank, env: Worlds) -> ResetBank:
   """Returns the bank with targets at the ends of the primitives.
 
   At the object, it is where the object primitive alone comes to rest. At the goal, it
-  is where the scripted expert solves the task, or where it is when its time is over.
-  Plays two episodes per row, which takes minutes for thousands of rows.
+  is where the scripted expert begins to open the hand, or where its episode ends if it
+  does not open it. Plays two episodes per row, which takes minutes for thousands of
+  rows.
 
   Args:
     bank: Reset states.
@@ -61,17 +63,20 @@ def with_static_targets(bank: ResetBank, env: Worlds) -> ResetBank:
   print_line(f"playing from {bank.rows:,} reset states for the static targets")
   reach, solve = PRIMITIVES.index("object"), PRIMITIVES.index("goal")
 
+  def reaching(state: EnvState) -> tuple[Array, Array]:
+    return state.timestep.primitives[:, reach], jnp.ones_like(state.timestep.last)
+
+  def solving(state: EnvState) -> tuple[Array, Array]:
+    close = state.timestep.primitives[:, solve, ARM_DOF] > 0.5
+    return env.expert_action(state), close
+
   @jax.jit
   def ends(rows: Int[Array, " worlds"]) -> Float[Array, "worlds 2 6"]:
-    return jnp.stack(
-      [
-        _end(
-          env, rows, lambda state: state.timestep.primitives[:, reach], REACH_PERIODS
-        ),
-        _end(env, rows, env.expert_action, env.config.episode_steps),
-      ],
-      axis=1,
+    found = (
+      _end(env, rows, reaching, REACH_PERIODS),
+      _end(env, rows, solving, env.config.episode_steps),
     )
+    return jnp.stack(found, axis=1)
 
   starts = range(0, bank.rows, AT_ONCE)
   last = bank.rows - 1
@@ -84,14 +89,19 @@ def with_static_targets(bank: ResetBank, env: Worlds) -> ResetBank:
 def _end(
   env: Worlds, rows: Int[Array, " worlds"], policy: Policy, periods: int
 ) -> Float[Array, "worlds 6"]:
-  """Returns the joint angles (rad) at the last instant of episodes, or after a time."""
+  """Plays until episodes end or for a time.
+
+  Returns:
+    The joint angles (rad) to which the last action led that counts.
+  """
   joints, key = env.task.scene.arm_qpos, jax.random.key(0)
 
   def period(carry: tuple[EnvState, Array, Array]) -> tuple[EnvState, Array, Array]:
     state, q, over = carry
-    state = env.step(state, policy(state), key)
+    action, counts = policy(state)
+    state = env.step(state, action, key)
     over |= state.elapsed == 0  # A broken world has begun another episode.
-    q = where_world(over, q, state.physics.qpos[:, joints])
+    q = where_world(counts & ~over, state.physics.qpos[:, joints], q)
     over |= state.timestep.last | (state.elapsed >= periods)
     return state, q, over
 

@@ -70,8 +70,8 @@ def diagnose(
   Returns:
     acting: The rule that was played.
     solved: Episodes solved by each acting rule, see ``agents/acting.py``.
-    failures: Failed episodes by their last stage. "object after goal" is an object that
-      was lost.
+    failures: Failed episodes by their last stage. In "object after goal" the hand has
+      lost the object, or still holds it at the goal.
     stages: For each stage, the share of instants, the error of each primitive (rad/s),
       the share of wrong gripper commands of the primitive in use, and the share of
       actions whose command is not the expert's. If only the latter is high, Q and the
@@ -156,7 +156,7 @@ def make_recorder(
 def expert_stage(env: Env, state: EnvState) -> Array:
   """Returns the index of the primitive that the expert would follow, i32[worlds]."""
   followed = env.expert_action(state)[:, None]
-  return jnp.argmin(_arm_error(state.timestep.primitives, followed), axis=-1)
+  return jnp.argmin(_arm_error(env.moving_primitives(state), followed), axis=-1)
 
 
 def _arm_error(a: Array, b: Array) -> Array:

@@ -243,6 +243,13 @@ def test_a_command_must_take_effect_before_the_next_one():
     validate(TrainConfig(env=env))
 
 
+def test_demonstrations_have_no_static_targets():
+  config = changed("replay.demonstrations", "demonstrations.npz")
+  validate(config)
+  with pytest.raises(ConfigError, match="env.static_targets .* use one of them"):
+    validate(replaced(config, ["env", "static_targets"], True))
+
+
 def test_episode_steps_of_the_paper():
   assert EnvConfig().episode_steps == 93
   assert EnvConfig(time_limit_s=1.5, control_period_s=0.15).episode_steps == 10

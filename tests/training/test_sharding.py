@@ -200,7 +200,7 @@ def test_uneven_splits_are_rejected(devices, message):
 @pytest.mark.parametrize(
   ("options", "message"),
   [
-    (["--devices", "99"], "--devices 99 must be within 0 (all) and 1"),
+    (["--devices", "99"], "--devices 99 must be from 0 (all) to 1"),
     (["--coordinator", "a:1"], "processes of one run must be given the same --run"),
     (["--processes", "2"], "--processes and --process need a --coordinator"),
   ],

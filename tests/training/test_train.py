@@ -209,9 +209,9 @@ def test_a_checkpoint_is_read_before_the_run_may_remove_it(
 @pytest.mark.parametrize(
   ("argument", "words"),
   [
-    ({"bank_seed": -1}, "bank_seed=-1 must be within"),
+    ({"bank_seed": -1}, "bank_seed=-1 must be from"),
     ({"episodes": 0}, "episodes=0 must be at least 1"),
-    ({"seed": -1}, "seed=-1 must be within"),
+    ({"seed": -1}, "seed=-1 must be from"),
     ({"backend": "bullet"}, "'bullet'; choose from auto"),
     ({"video": "x.avi"}, "x.avi must end in .mp4 or .gif"),
   ],

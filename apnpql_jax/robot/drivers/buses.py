@@ -26,7 +26,7 @@ import time
 from typing import Any, Protocol
 
 from apnpql_jax.errors import DeviceError, one_line
-from apnpql_jax.robot.drivers import vendor
+from apnpql_jax.robot.vendors import vendor
 
 ATTEMPTS = 3  # without an answer, after which the gripper counts as lost
 _ANSWER_S = 0.037  # for one answer by Modbus; the SDK waits as long for four bytes

@@ -26,11 +26,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 from apnpql_jax.errors import DeviceError, one_line
-from apnpql_jax.robot.drivers import vendor
 from apnpql_jax.robot.drivers.ur_check import check_controller
 from apnpql_jax.robot.drivers.ur_state import VARIABLES, Reports
 from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.protocols import ArmState
+from apnpql_jax.robot.vendors import vendor
 
 LOOKAHEAD = 0.03  # s, the least that servoJ takes
 GAIN = 300.0  # of servoJ, in 100..2000

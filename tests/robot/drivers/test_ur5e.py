@@ -57,7 +57,7 @@ def wait_for_fault(arm: UR5e) -> str:
 
 def test_the_state_is_that_of_the_plant(rig):
   state = rig.arm.get_observation()
-  np.testing.assert_allclose(state.position, rig.state()["position"], atol=1e-6)
+  np.testing.assert_allclose(state.position, rig.ask("state")["position"], atol=1e-6)
   np.testing.assert_allclose(state.velocity, np.zeros(6), atol=1e-4)
   assert not state.fault
   assert 0 <= time.monotonic() - state.time < 0.1
@@ -88,7 +88,7 @@ def test_it_brakes_to_rest_and_starts_again(rig):
     rig.arm.send_action(rest.position)
   rig.arm.start()
   servo(rig.arm, lambda _: start, 1.0)
-  np.testing.assert_allclose(rig.state()["position"], start, atol=1e-3)
+  np.testing.assert_allclose(rig.ask("state")["position"], start, atol=1e-3)
 
 
 @pytest.mark.parametrize("joints", [np.zeros(7), np.full(6, np.nan)])
@@ -116,7 +116,7 @@ def test_start_keeps_the_zero_if_asked_to():
 
 
 def test_the_zero_of_the_wrench_drifts_until_the_next_one(rig):
-  rig.drift_force()
+  rig.ask("drift_force")
   rig.arm.stop()
   np.testing.assert_allclose(rig.arm.get_observation().wrench, DRIFT, atol=1e-3)
   rig.arm.start()
@@ -149,7 +149,7 @@ def test_the_table_pushes_the_tool_up(rig):
 def test_each_fault_is_one_line_in_time(rig, cause, text):
   start = rig.arm.get_observation().position
   servo(rig.arm, lambda _: start, 0.05)
-  getattr(rig, cause)()
+  rig.ask(cause)
   begin = time.monotonic()
   fault = wait_for_fault(rig.arm)
   assert time.monotonic() < begin + 0.5
@@ -219,7 +219,7 @@ import gc, time
 from apnpql_jax.robot import doubles
 with doubles.start("push_plate") as rig:
   rig.arm.start()
-  rig.drop_rtde()
+  rig.ask("drop_rtde")
   time.sleep(0.5)
   rig.arm.disconnect()
   rig.arm = None
@@ -235,14 +235,14 @@ print("alive")
 def test_it_starts_again_after_the_program_stopped(rig):
   start = rig.arm.get_observation().position
   servo(rig.arm, lambda t: start + [0.5 * t, 0, 0, 0, 0, 0], 0.5)
-  rig.stop_program()
+  rig.ask("stop_program")
   wait_for_fault(rig.arm)
   rig.arm.stop()
   time.sleep(0.3)
-  rest = np.array(rig.state()["position"])
+  rest = np.array(rig.ask("state")["position"])
   rig.arm.start()
   time.sleep(0.3)  # A program that obeys the old target would move the arm.
-  np.testing.assert_allclose(rig.state()["position"], rest, atol=1e-4)
+  np.testing.assert_allclose(rig.ask("state")["position"], rest, atol=1e-4)
   servo(rig.arm, lambda t: rest + [0.2 * t, 0, 0, 0, 0, 0], 0.5)
   assert not rig.arm.get_observation().fault
   assert rig.arm.get_observation().position[0] > rest[0] + 0.05
