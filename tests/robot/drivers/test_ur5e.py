@@ -201,16 +201,16 @@ def test_the_program_goes_on_at_rest_while_the_arm_is_read(rig):
   while time.monotonic() < end:
     rig.arm.get_observation()
     time.sleep(TIMESTEP)
-  assert rig.state()["program_runs"]
+  assert rig.ask("state")["program_runs"]
   time.sleep(2 / WATCHDOG)  # Nobody reads.
-  assert not rig.state()["program_runs"]
+  assert not rig.ask("state")["program_runs"]
   rig.arm.start()
-  assert rig.state()["program_runs"] and rig.state()["programs"] == 2
+  assert rig.ask("state")["program_runs"] and rig.ask("state")["programs"] == 2
 
 
 def test_a_command_that_the_double_lacks_ends_the_program(rig):
   assert not rig.arm._control.setTcp([0.0] * 6)
-  assert not rig.state()["program_runs"]
+  assert not rig.ask("state")["program_runs"]
 
 
 def test_a_lost_connection_does_not_end_the_process():
