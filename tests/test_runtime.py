@@ -71,7 +71,7 @@ def test_no_import_prints_about_the_optional_warp():
   modules = [p for x in ("apnpql_jax", "benchmarks") for p in (ROOT / x).rglob("*.py")]
   users = {p.stem for p in modules if re.search(IMPORTS_MJX, p.read_text())}
   assert users == {"quiet_mjx"}
-  assert run("import apnpql_jax.envs.contact_report") == ""
+  assert run("import apnpql_jax.tasks.contact_report") == ""
 
 
 @pytest.mark.parametrize(

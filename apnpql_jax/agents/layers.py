@@ -108,7 +108,7 @@ class ValueHead(nn.Module):
   ) -> Float[Array, " s *b n"]:
     """Returns as many outputs per action as ``initial`` has.
 
-    ``product`` replaces ``lax.dot_general`` in the layers that run once per action.
+    ``product`` replaces ``lax.dot_general`` in the layers after the first.
     """
     width, *rest = self.hidden
     dense = functools.partial(nn.Dense, dot_general=product)
@@ -157,4 +157,4 @@ def bfloat16_product(lhs: Array, rhs: Array, *args: Any, **_: Any) -> Array:
 
 
 PRODUCTS: dict[str, Product | None] = {"float32": None, "bfloat16": bfloat16_product}
-"""Names of precisions -> products of layers that run once per candidate action."""
+"""Names of precisions -> products of a value head's layers after the first."""

@@ -18,12 +18,14 @@ from apnpql_jax.agents.acting import choose_action
 from apnpql_jax.agents.augmentation import augment
 from apnpql_jax.agents.columns.candidates import Candidates
 from apnpql_jax.agents.columns.policy_evaluation import PolicyEvaluation
+from apnpql_jax.agents.columns.policy_update import Improvement
 from apnpql_jax.agents.explanation import Explanation, explain
 from apnpql_jax.agents.networks import Heads, Networks, Params, make_networks
 from apnpql_jax.agents.table_one import Algorithm, algorithm_of, epsilon_bounds
 from apnpql_jax.config.checks import check_agent
 from apnpql_jax.config.schema import AgentConfig
 from apnpql_jax.dists import boltzmann
+from apnpql_jax.dists.action import ActionDistribution
 from apnpql_jax.types import Array, Metrics, Observation, Transition
 
 FINAL_RATE = 0.1
@@ -237,43 +239,59 @@ def total_loss(
 ) -> tuple[Float[Array, ""], Metrics]:
   """Sums the losses of Algorithm 1; each trains only its own parameters."""
   config = networks.config
-  # Evaluate the networks at s_tm1.
+  # Evaluate the networks at s_tm1. Rows whose regularizer does not read the target
+  # network's heads do not pay for them: XLA drops what nothing uses.
   heads = networks.at(trained, batch.observation_tm1)
-  slow = networks.at(target_params, batch.observation_tm1)
+  target_heads = networks.at(target_params, batch.observation_tm1)
   predicted, label = heads.primitives(), batch.primitives_tm1
   outputs = heads.z(batch.action_tm1[None])[0]
   # Improve the policy, and compute the losses of all columns of Table I.
-  prior = algorithm.regularizer(heads, slow)
+  prior = algorithm.regularizer(heads, target_heads)
   improved = algorithm.policy_update(heads, prior, key)
-  candidates = improved.candidates
-  q_values, weights = candidates.q_values, improved.weights
+  candidates, nu = improved.candidates, trained["nu"]
   terms = {
     "loss/ap": losses.ap_loss(predicted, label, delta=config.ap_delta),
     "loss/q": evaluation.loss(outputs, target),
     **improved.losses,
-    **algorithm.regularizer_update(heads, prior, candidates, batch, key, trained["nu"]),
+    **algorithm.regularizer_update(heads, prior, candidates, batch, key, nu),
   }
-  # Average losses and diagnostics over the real transitions of the batch.
+  # Average them over the real transitions of the batch, and add up.
+  means = {k: losses.weighted_mean(v, batch.weight) for k, v in terms.items()}
+  scale = {"loss/ap": config.lambda_ap}
+  total = jnp.sum(jnp.stack([scale.get(k, 1.0) * x for k, x in means.items()]))
+  extra = {"q/data": evaluation.value(outputs), "q/target": evaluation.expected(target)}
+  return total, means | _diagnostics(heads, predicted, prior, improved, extra, batch)
+
+
+def _diagnostics(
+  heads: Heads,
+  predicted: Float[Array, " B 3 7"],
+  prior: ActionDistribution,
+  improved: Improvement,
+  extra: Metrics,
+  batch: Transition,
+) -> Metrics:
+  """Returns means, extremes and percentiles over the batch, which train nothing.
+
+  ``extra`` holds further numbers per state, f32[B] each, by name.
+  """
+  q_values, label = improved.candidates.q_values, batch.primitives_tm1
   velocity_error = jnp.abs(predicted - label)[..., :-1]
   wrong_gripper = (predicted[..., -1] > 0) != (label[..., -1] > 0)
-  per_state = terms | {
+  per_state = extra | {
     "ap/error": jnp.mean(velocity_error, axis=(-2, -1)),  # rad/s
     "ap/gripper_error": jnp.mean(wrong_gripper, axis=-1),  # share of wrong commands
-    "npql/kl_over_eps": improved.kl / config.epsilon,
-    "npql/ess": boltzmann.effective_sample_size(weights),
+    "npql/kl_over_eps": improved.kl / heads.config.epsilon,
+    "npql/ess": boltzmann.effective_sample_size(improved.weights),
     "npql/alpha_mean": heads.alpha(),
-    "npql/max_weight": jnp.max(weights, axis=0),
+    "npql/max_weight": jnp.max(improved.weights, axis=0),
     "prior/entropy": prior.entropy_bound(),
     "policy/entropy": improved.entropy,
     "q/mean": jnp.mean(q_values, axis=0),
-    "q/data": evaluation.value(outputs),
-    "q/target": evaluation.expected(target),
   }
   metrics = {k: losses.weighted_mean(v, batch.weight) for k, v in per_state.items()}
-  scale = {"loss/ap": config.lambda_ap}
-  total = jnp.sum(jnp.stack([scale.get(k, 1.0) * metrics[k] for k in terms]))
   metrics["q/min"], metrics["q/max"] = jnp.min(q_values), jnp.max(q_values)
   highest = functools.partial(jnp.quantile, q=0.95)
   metrics["npql/kl_over_eps_p95"] = highest(per_state["npql/kl_over_eps"])
   metrics["npql/alpha_p95"] = highest(per_state["npql/alpha_mean"])
-  return total, metrics
+  return metrics

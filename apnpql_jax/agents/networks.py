@@ -54,10 +54,11 @@ class Networks:
 
   def at(self, params: Params, observation: Observation) -> Heads:
     """Returns the heads at a batch of states; only this method runs the encoder."""
-    given = observation.primitives
-    if given is not None and self.config.lstm_instants:
-      given = given[..., -1, :, :]
-    return Heads(self, params, self.apply("encoder", params, observation), given)
+    true_primitives = observation.primitives
+    if true_primitives is not None and self.config.lstm_instants:
+      true_primitives = true_primitives[..., -1, :, :]
+    phi = self.apply("encoder", params, observation)
+    return Heads(self, params, phi, true_primitives)
 
   def apply(self, group: str, params: Params, *inputs: Any, **options: Any) -> Any:
     """Applies the module of ``group`` to ``inputs``."""
@@ -103,8 +104,8 @@ class Heads:
   networks: Networks
   params: Params
   phi: Float[Array, "*b feature_dim"]
-  given: Float[Array, "*b 3 7"] | None
-  """True primitives, which replace the predicted ones in the prior."""
+  true_primitives: Float[Array, "*b 3 7"] | None
+  """Those of the observation, which replace the predicted ones in the prior."""
 
   @property
   def config(self) -> AgentConfig:
@@ -186,10 +187,10 @@ class Heads:
     return self.networks.value(self.z(actions))
 
   def _means(self) -> Float[Array, "*b 3 7"]:
-    if self.given is None:
+    if (true := self.true_primitives) is None:
       return self.frozen().primitives()
     sure = _SURE if self.config.primitive_gripper else 0.0
-    return self.given.at[..., -1].set(sure * (2.0 * self.given[..., -1] - 1.0))
+    return true.at[..., -1].set(sure * (2.0 * true[..., -1] - 1.0))
 
   def _apply(self, group: str, *inputs: Array, **options: Any) -> Any:
     return self.networks.apply(group, self.params, *inputs, **options)

@@ -22,7 +22,7 @@ from apnpql_jax.agents.columns.policy_evaluation import (
 from apnpql_jax.agents.columns.policy_update import (
   Improvement,
   forward_kl,
-  none,
+  keep_q,
   reverse_kl,
 )
 from apnpql_jax.agents.columns.regularizer import (
@@ -45,7 +45,7 @@ from apnpql_jax.errors import ConfigError, check_name
 class Algorithm:
   """One row of Table I; the columns are functions."""
 
-  regularizer: Callable[..., ActionDistribution]  # (heads, target network's heads) -> b
+  regularizer: Callable[..., ActionDistribution]  # (heads, target_heads) -> b
   policy: Callable[..., Candidates]  # (heads, b, key, num_samples)
   regularizer_update: Callable[..., Losses]  # (heads, b, candidates, batch, key, nu)
   policy_update: Callable[..., Improvement]  # (heads, b, key)
@@ -65,7 +65,7 @@ ALGORITHMS = {
   # regularizer      policy          regularizer       policy      policy
   #                                  update            update      evaluation
   "ap_npql": Algorithm(
-    behavior_prior,  non_parametric, fit_candidates,   none,       Categorical),
+    behavior_prior,  non_parametric, fit_candidates,   keep_q,     Categorical),
   "ap_mpo": Algorithm(
     behavior_prior,  parametric,     fit_candidates,   forward_kl, Categorical),
   "ap_sac": Algorithm(
@@ -79,9 +79,9 @@ ALGORITHMS = {
   "sac": Algorithm(
     uniform,         parametric,     no_update,        reverse_kl, ClippedDoubleQ),
   "ap_cem": Algorithm(  # not in the paper: QT-Opt's policy with b around primitives
-    behavior_prior,  cem,            fit_candidates,   none,       ClippedDoubleQ),
+    behavior_prior,  cem,            fit_candidates,   keep_q,     ClippedDoubleQ),
   "ap_dagger": Algorithm(  # not in the paper: b imitates the expert, Q is not used
-    behavior_prior,  prior_alone,    fit_expert,       none,       Categorical),
+    behavior_prior,  prior_alone,    fit_expert,       keep_q,     Categorical),
 }  # fmt: skip
 
 POLICY_EVALUATIONS = {  # values of ``agent.policy_evaluation`` other than "row"

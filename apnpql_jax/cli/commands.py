@@ -162,7 +162,7 @@ def convert(args: Convert) -> Json:
   env = task_env(args.task)
 
   from apnpql_jax import devices, tasks
-  from apnpql_jax.data import demonstrations, lerobot, real_arm
+  from apnpql_jax.data import demonstrations, lerobot, recordings
   from apnpql_jax.data.lerobot import conversion
 
   devices.start()
@@ -173,7 +173,7 @@ def convert(args: Convert) -> Json:
   elif demonstrations.is_demonstrations(recording):
     demos = demonstrations.load(recording, task, env, allow_unsolved=True)
   else:
-    demos = real_arm.convert(recording, task.scene, period_s=env.control_period_s)
+    demos = recordings.convert(recording, task.scene, period_s=env.control_period_s)
   if not args.allow_unsolved:
     demonstrations.check_solved(demos, task, env, flag="--allow-unsolved")
   demonstrations.check_reachable(demos, task)
@@ -210,7 +210,7 @@ def list_names(args: List) -> Json:
     for name in tasks.registered_by(module.__name__):
       tasks.make_task(name)
   if args.contacts:
-    from apnpql_jax.envs.contact_report import contact_report
+    from apnpql_jax.tasks.contact_report import contact_report
 
     return {name: contact_report(tasks.make_task(name)) for name in names}
   return {

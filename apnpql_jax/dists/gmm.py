@@ -109,12 +109,6 @@ class GripperGMM(ActionDistribution):
     """Moves the n samples of ``value`` back before the batch."""
     return jnp.moveaxis(x, -1, 0).reshape(value.shape[:-1])
 
-  def entropy(self) -> Float[Array, "*b"]:
-    """Returns the entropy of one component in nats; several have no closed form."""
-    if self.logits.shape[-1] > 1:
-      raise NotImplementedError("entropy of several components; see entropy_bound")
-    return self.component_entropy()[..., 0]
-
   def component_entropy(self) -> Float[Array, "*b k"]:
     """Returns the entropy of each component in nats: Gaussian plus Bernoulli."""
     dim = self.loc.shape[-1]

@@ -47,7 +47,7 @@ def make_randomize(config: RandomizationConfig, scene: Scene) -> Randomize:
     visuals.texture(draw, world)
     visuals.light(draw, world)
     _cameras(draw, world)
-    _table(draw, world)
+    _base(draw, world)
     qpos = objects.scale(draw, world, state.qpos)
     objects.weigh(draw, world)
     if config.size or config.shape or config.mass:
@@ -86,7 +86,7 @@ def _cameras(draw: Draw, world: World) -> None:
     world["cam_fovy"] *= draw.factor("field_of_view", (count,))
 
 
-def _table(draw: Draw, world: World) -> None:
+def _base(draw: Draw, world: World) -> None:
   config, base = draw.config, world.model.body("base").id
   if config.table_height:
     lower = jnp.append(jnp.zeros(2), -draw.uniform("table_height"))

@@ -136,7 +136,7 @@ class FlipCup(TableTask):
     turn = jnp.where(held, roll + free * (np.pi / 2 - roll), empty_roll)
     heading = jnp.where((held & (free < 1))[:, None], reach, outward)
     at_object, at_goal = _hand(reach, roll), _hand(heading, turn)
-    neutral = jnp.broadcast_to(self._neutral_mat, (*roll.shape, 3, 3))
+    neutral = jnp.broadcast_to(self.neutral_mat, (*roll.shape, 3, 3))
     positions = self.with_neutral(to_object, to_goal)
     close = pinch.grip(around=around, held=held, done=self._placed(state))
     return positions, jnp.stack([at_object, at_goal, neutral], 1), close

@@ -55,7 +55,7 @@ class PlacePlate(TableTask):
     self._goal, self._holder = self.scene.mocap("goal"), self.scene.mocap("holder")
     self._hand = Pinch(
       self.scene,
-      self._neutral_mat,
+      self.neutral_mat,
       width=THICKNESS,
       hover=HOVER,
       travel=TRAVEL,
@@ -100,7 +100,7 @@ class PlacePlate(TableTask):
     around = self._hand.around(kinematics, edge, twist)
     close = grip(around=around, held=held, done=self._in_box(state))
     positions = self.with_neutral(to_object, to_goal)
-    return positions, geometry.rotation_z(turns) @ self._neutral_mat, close
+    return positions, geometry.rotation_z(turns) @ self.neutral_mat, close
 
   def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:
     """Checks that the plate is on the floor of the box, at rest and released."""

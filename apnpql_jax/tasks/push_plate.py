@@ -86,7 +86,7 @@ class PushPlate(TableTask):
     to_goal = jnp.where(inside, dragged, over_goal)
 
     positions = self.with_neutral(to_object, to_goal)
-    rotations = jnp.broadcast_to(self._neutral_mat, (*positions.shape, 3))
+    rotations = jnp.broadcast_to(self.neutral_mat, (*positions.shape, 3))
     return positions, rotations, jnp.ones(positions.shape[:2])
 
   def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:

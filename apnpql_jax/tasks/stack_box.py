@@ -48,7 +48,7 @@ class StackBox(TableTask):
     self._blue = FreeBody(*self.scene.free_joint("blue"))
     # Four millimeters above the center, for room between fingers and table.
     self._hand = Pinch(
-      self.scene, self._neutral_mat, width=SIDE, hover=HOVER, travel=TRAVEL, above=0.004
+      self.scene, self.neutral_mat, width=SIDE, hover=HOVER, travel=TRAVEL, above=0.004
     )
 
   def sample_resets(self, rng: np.random.Generator, count: int) -> ResetDraw:
@@ -80,7 +80,7 @@ class StackBox(TableTask):
     turns = jnp.stack([yaw, yaw * held, 0 * yaw], 1)
     around = self._hand.around(kinematics, yellow, twist)
     close = grip(around=around, held=held, done=self._placed(state))
-    return positions, geometry.rotation_z(turns) @ self._neutral_mat, close
+    return positions, geometry.rotation_z(turns) @ self.neutral_mat, close
 
   def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:
     """Checks that yellow stands on blue, both at rest and released by the gripper."""

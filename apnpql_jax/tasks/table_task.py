@@ -50,7 +50,7 @@ class TableTask:
   """Base of the tasks.
 
   The scene is ``<name>.xml`` next to the file of the class, or else in ``mjcf/``. It
-  has a keyframe ``neutral``.
+  has a keyframe ``neutral``, where the rotation of the tool is ``neutral_mat``.
   """
 
   name: str
@@ -63,7 +63,7 @@ class TableTask:
     self._neutral_qpos = self.scene.keyframe("neutral")
     neutral = jnp.asarray(self._neutral_qpos[self.scene.arm_qpos], jnp.float32)
     chain = arm.make_chain(self.scene)
-    self._neutral_pos, self._neutral_mat, _ = arm.forward(chain, neutral)
+    self._neutral_pos, self.neutral_mat, _ = arm.forward(chain, neutral)
 
   def _mjcf(self) -> Path:
     """Returns the path of the scene, or raises ``ConfigError`` if there is none."""

@@ -45,7 +45,7 @@ class TouchBall(TableTask):
     """Returns a point 8 cm above the ball, the ball itself, and closed fingers."""
     ball = state.mocap_pos[:, self._ball]
     positions = self.with_neutral(ball + jnp.asarray([0.0, 0.0, 0.08]), ball)
-    rotations = jnp.broadcast_to(self._neutral_mat, (*positions.shape, 3))
+    rotations = jnp.broadcast_to(self.neutral_mat, (*positions.shape, 3))
     return positions, rotations, jnp.ones(positions.shape[:2])
 
   def success(self, state: PhysicsState, kinematics: Kinematics) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import functools
 from typing import Any
 
 import jax
@@ -29,6 +30,9 @@ from apnpql_jax.types import Array, Slot
 
 ExpertReplayMaker = Callable[[TrainConfig, Env, PRNGKeyArray], Replay | None]
 """(settings, worlds, key) -> expert replay, or None if it has no slots."""
+
+RecordedStates = Callable[[Demonstrations, Array | np.ndarray], PhysicsState]
+"""(one instant per world, the numbers of their episodes) -> states of the worlds."""
 
 CERTAIN = 100.0
 """Log density in nats of actions of an unknown policy: so high that Retrace cuts the
@@ -85,46 +89,63 @@ def replay_from_demonstrations(
   kept = demonstrations.until_end(demos, env.task, env.config)
   columns, ends = _columns(demos.first[kept], length, worlds)
   index = kept[columns]
-  slots = demos.rows(index)
+  recorded = demos.rows(index)
   targets = np.zeros((length, worlds, 3, 6), np.float32)
-  targets[slots.first] = demonstrations.solve_targets(
-    demos, index[slots.first], env.task
+  targets[recorded.first] = demonstrations.solve_targets(
+    demos, index[recorded.first], env.task
   )
-
-  episode = np.cumsum(slots.first.T).reshape(worlds, length).T
-  randomize = None
-  if config.env.randomize:
-    randomize = make_randomize(seen_only(config.env.randomization), env.task.scene)
-
-  def states(shown: Demonstrations, episode: Array | np.ndarray) -> PhysicsState:
-    now = shown.states(env.task.scene)
-    if randomize is None:
-      return now
-    return randomize(now, jax.vmap(jax.random.fold_in, (None, 0))(key, episode))
-
-  @jax.jit
-  def remake(
-    start: EnvState, slots: Demonstrations, targets: Array, ends: Array, episode: Array
-  ) -> Replay:
-    def step(before: EnvState, inputs: tuple) -> tuple[EnvState, Slot]:
-      shown, targets, ends, episode = inputs
-      now = states(shown, episode)
-      state = env.observe(Arrival.after(before, now, targets, shown.first))
-      timestep = state.timestep
-      timestep = timestep.replace(
-        truncated=timestep.truncated | ends & ~timestep.terminated
-      )
-      action = jnp.asarray(shown.action, jnp.float32)
-      return state, Slot(timestep, action, jnp.full(worlds, CERTAIN, jnp.float32))
-
-    _, chunk = jax.lax.scan(step, start, (slots, targets, ends, episode))
-    ring = replay.add(replay.create(example_slot(start), length, worlds), chunk)
-    return place(ring, env.mesh)
-
-  start = env.reset(jnp.zeros(worlds, jnp.int32))
+  # Number the episodes column by column, so that each has a draw of its own.
+  episode = np.cumsum(recorded.first.T).reshape(worlds, length).T
+  states = _make_states(config, env, key)
+  before = env.reset(jnp.zeros(worlds, jnp.int32))
   # The fields that are drawn are fewer than those of the worlds.
-  start = start.replace(physics=states(slots.rows(np.array(0)), episode[0]))
-  return remake(start, slots, targets, ends, episode)
+  before = before.replace(physics=states(recorded.rows(np.array(0)), episode[0]))
+  observe_all = jax.jit(functools.partial(_observe_all, env, states))
+  return observe_all(before, (recorded, targets, ends, episode))
+
+
+def _make_states(config: TrainConfig, env: Env, key: PRNGKeyArray) -> RecordedStates:
+  """Returns how recorded instants become states, with drawn worlds if wanted."""
+  scene = env.task.scene
+  if not config.env.randomize:
+    return lambda recorded, episode: recorded.states(scene)
+  randomize = make_randomize(seen_only(config.env.randomization), scene)
+
+  def states(recorded: Demonstrations, episode: Array | np.ndarray) -> PhysicsState:
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, episode)
+    return randomize(recorded.states(scene), keys)
+
+  return states
+
+
+def _observe_all(
+  env: Env,
+  states: RecordedStates,
+  before: EnvState,
+  instants: tuple[Demonstrations, Array, Array, Array],
+) -> Replay:
+  """Returns the replay of what the worlds observe at recorded instants.
+
+  ``before`` holds any worlds of the right shapes. ``instants`` are, [length, worlds,
+  ...] each, what was recorded, the joint targets of the primitives where an episode
+  begins, where one ends, and its number.
+  """
+  length, worlds = instants[0].first.shape
+
+  def step(before: EnvState, inputs: tuple) -> tuple[EnvState, Slot]:
+    recorded, targets, ends, episode = inputs
+    now = states(recorded, episode)
+    state = env.observe(Arrival.after(before, now, targets, recorded.first))
+    timestep = state.timestep
+    timestep = timestep.replace(
+      truncated=timestep.truncated | ends & ~timestep.terminated
+    )
+    action = jnp.asarray(recorded.action, jnp.float32)
+    return state, Slot(timestep, action, jnp.full(worlds, CERTAIN, jnp.float32))
+
+  _, chunk = jax.lax.scan(step, before, instants)
+  ring = replay.add(replay.create(example_slot(before), length, worlds), chunk)
+  return place(ring, env.mesh)
 
 
 def _columns(

@@ -105,13 +105,6 @@ class Resumed(NamedTuple):
   intact: bool  # whether the segments on disk are what is in the replays
 
 
-def restore(
-  config: TrainConfig, run_dir: Path, example: TrainState, warn: Callable[[str], None]
-) -> TrainState:
-  """Returns the state of ``restore_run``, which has the same arguments."""
-  return restore_run(config, run_dir, example, warn).state
-
-
 def restore_run(
   config: TrainConfig,
   run_dir: Path,

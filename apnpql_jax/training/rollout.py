@@ -15,7 +15,7 @@ from apnpql_jax.agents.networks import Params
 from apnpql_jax.data import replay
 from apnpql_jax.data.replay import Replay
 from apnpql_jax.envs.env import Env
-from apnpql_jax.envs.state import EnvState
+from apnpql_jax.envs.state import Arrival, EnvState
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.types import ACTION_DIM, ARM_DOF, Array, Slot
 
@@ -111,6 +111,10 @@ Player = Callable[[Any, Array, PRNGKeyArray], Episodes]
 """(parameters of the policy, bank rows i32[worlds], key) -> episodes."""
 
 
+_Carry = tuple[Arrival, Episodes, Array, Array | int, PRNGKeyArray]
+"""Worlds, their episodes so far, which still run, time, key."""
+
+
 def make_player(env: Env, make_policy: Callable[[Any], WorldPolicy]) -> Player:
   """Returns a jitted function that plays one episode per row until all are over.
 
@@ -121,7 +125,7 @@ def make_player(env: Env, make_policy: Callable[[Any], WorldPolicy]) -> Player:
   def play(params: Any, rows: Array, key: PRNGKeyArray) -> Episodes:
     policy = make_policy(params)
 
-    def step(carry):
+    def step(carry: _Carry) -> _Carry:
       now, played, running, time, key = carry
       state = env.observe(now)
       running &= state.faults == 0

@@ -226,36 +226,15 @@ def _start(
     path = run_folder.open_run(run_dir).path
     for change in provenance.changed_versions(path, devices=count):
       _print_line(f"changed since the run began: {change}")
-  saved = resume and checkpoint_reader.latest_step(run_dir) is not None
-  if saved:
-    checkpoint_reader.restore(run_dir, None, {}, config=config)  # Fails early.
-  fill = None if saved else _expert(config)
-  weights = initial_weights.read(path) if resume and not saved else None
+    if checkpoint_reader.latest_step(run_dir) is not None:
+      return _restored(config, run_dir, mesh)
+  fill = _expert(config)
+  weights = initial_weights.read(run_dir.absolute()) if resume else None
   if origin:
     weights = initial_weights.load(*origin, config, mesh)
     about = weights.origin
     _print_line(f"starting with the weights of {about['run']}, step {about['step']:,}")
-  agent = make_agent(config.agent)  # Before the worlds, which can take minutes.
-  instants, imitated = config.agent.lstm_instants, table_one.imitates(config.agent)
-  env = make_env(config.env, mesh, instants=instants, imitated=imitated)
-  example = example_state(config, env, agent)
-  devices.check_memory(needed_memory(example), "the training")
-  if warning := run_folder.check_disk(run_dir, *disk_bytes(config, example, saved)):
-    _print_line(warning)
-  # Compile while the state is being made or read, which also compiles: XLA keeps a
-  # second core busy that way.
-  background = futures.ThreadPoolExecutor(1)
-  iteration = background.submit(compile_iteration, config, env, agent, example)
-  background.shutdown(wait=False)
-  if fill is None:
-    state, intact = restore_run(
-      config,
-      run_dir,
-      example,
-      _print_line,
-      refill=lambda: initial_expert(config, env, _expert(config)),
-    )
-    return Start(env, agent, iteration, path, state, int(state.env_steps), intact)
+  env, agent, iteration, _ = _build(config, run_dir, mesh, resumed=False)
   _print_line("filling the expert replay")
   state = initial_state(config, env, agent, fill)
   state = initial_weights.put(weights, state) if weights else state
@@ -265,19 +244,53 @@ def _start(
     _print_line(f"expert replay: {solved} of {ended} episodes solved")
   if resume:
     _print_line("the run has no checkpoint yet and starts from the beginning")
-    return Start(env, agent, iteration, path, state, 0)
-  devices.run_on_primary(
-    lambda: run_folder.create(
-      run_dir,
-      config,
-      overwrite=overwrite,
-      devices=count,
-      origin=weights and weights.origin,
-      write_more=weights and weights.write,
+  else:
+    devices.run_on_primary(
+      lambda: run_folder.create(
+        run_dir,
+        config,
+        overwrite=overwrite,
+        devices=count,
+        origin=weights.origin if weights else None,
+        write_more=weights.write if weights else None,
+      )
     )
-  )
   path = run_folder.open_run(run_dir).path
-  return Start(env, agent, iteration, path, state, None)
+  return Start(env, agent, iteration, path, state, 0 if resume else None)
+
+
+def _restored(config: TrainConfig, run_dir: Path, mesh: Mesh | None) -> Start:
+  """Builds everything and reads the newest readable checkpoint."""
+  checkpoint_reader.restore(run_dir, None, {}, config=config)  # Fails early.
+  env, agent, iteration, example = _build(config, run_dir, mesh, resumed=True)
+  state, intact = restore_run(
+    config,
+    run_dir,
+    example,
+    _print_line,
+    refill=lambda: initial_expert(config, env, _expert(config)),
+  )
+  step = int(state.env_steps)
+  return Start(env, agent, iteration, run_dir.absolute(), state, step, intact)
+
+
+def _build(
+  config: TrainConfig, run_dir: Path, mesh: Mesh | None, *, resumed: bool
+) -> tuple[Env, Agent, futures.Future[Iteration], TrainState]:
+  """Returns worlds, agent, iteration and the state's shapes; checks what they take."""
+  agent = make_agent(config.agent)  # Before the worlds, which can take minutes.
+  instants, imitated = config.agent.lstm_instants, table_one.imitates(config.agent)
+  env = make_env(config.env, mesh, instants=instants, imitated=imitated)
+  example = example_state(config, env, agent)
+  devices.check_memory(needed_memory(example), "the training")
+  if warning := run_folder.check_disk(run_dir, *disk_bytes(config, example, resumed)):
+    _print_line(warning)
+  # Compile while the state is being made or read, which also compiles: XLA keeps a
+  # second core busy that way.
+  background = futures.ThreadPoolExecutor(1)
+  iteration = background.submit(compile_iteration, config, env, agent, example)
+  background.shutdown(wait=False)
+  return env, agent, iteration, example
 
 
 def needed_memory(example: TrainState) -> int:
@@ -297,7 +310,14 @@ def _expert(config: TrainConfig) -> ExpertReplayMaker:
   return functools.partial(expert.replay_from_demonstrations, demos)
 
 
-def _loop(config, start, iteration, reporter, saver, signals) -> TrainState:
+def _loop(
+  config: TrainConfig,
+  start: Start,
+  iteration: Iteration,
+  reporter: Reporter | None,
+  saver: CheckpointWriter,
+  signals: Signals,
+) -> TrainState:
   """Iterates to the last step; evaluates and saves at multiples of the intervals."""
   state, stop = start.state, False
   step = int(state.env_steps)
@@ -311,7 +331,7 @@ def _loop(config, start, iteration, reporter, saver, signals) -> TrainState:
       f"stopped at once; to continue: --resume {start.path}",
     )
     rings = to_rings(state, chunk=config.rollout_length)
-    metrics |= saver.proceed(rings)
+    metrics = {**metrics, **saver.proceed(rings)}
     if reporter:
       reporter.iteration(step, int(state.learner.step), metrics)
     skipped_updates.check(config, state, start.path)

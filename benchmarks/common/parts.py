@@ -18,11 +18,11 @@ import mujoco
 from apnpql_jax.agents.learner import Agent
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.envs.cameras import make_cameras
-from apnpql_jax.envs.contact_report import SUBSTEPS
 from apnpql_jax.envs.env import Env
 from apnpql_jax.envs.state import EnvState
 from apnpql_jax.sim.mjx import MjxPhysics
 from apnpql_jax.sim.physics import Physics, PhysicsState
+from apnpql_jax.tasks.contact_report import SUBSTEPS
 from apnpql_jax.training.rollout import agent_policy
 from apnpql_jax.types import ARM_DOF, Array
 from benchmarks.common import floor, timing

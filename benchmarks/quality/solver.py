@@ -15,10 +15,10 @@ import json
 
 from apnpql_jax import runtime
 from apnpql_jax.config.schema import EnvConfig
-from apnpql_jax.envs.contact_report import contact_report
 from apnpql_jax.envs.env import Env
 from apnpql_jax.primitives.reset_bank import load_bank
 from apnpql_jax.tasks import make_task, task_names
+from apnpql_jax.tasks.contact_report import contact_report
 from apnpql_jax.training.evaluate import play_held_out
 from apnpql_jax.training.rollout import expert_policy, make_player
 from benchmarks.common import settings, store

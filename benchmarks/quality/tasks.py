@@ -19,10 +19,10 @@ import numpy as np
 
 from apnpql_jax import runtime
 from apnpql_jax.config.schema import EnvConfig
-from apnpql_jax.envs.contact_report import contact_report
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.primitives.reset_bank import load_bank
 from apnpql_jax.tasks import make_task, task_names
+from apnpql_jax.tasks.contact_report import contact_report
 from apnpql_jax.training.evaluate import evaluate_expert
 from apnpql_jax.training.rollout import FILMED, expert_policy, make_player
 from apnpql_jax.training.video import film, record_episodes

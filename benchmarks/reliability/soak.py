@@ -258,7 +258,7 @@ def poison(run: Path, *, rewards: bool) -> None:
   config = run_folder.load_run_config(run)
   env, agent = make_env(config.env), make_agent(config.agent)
   example = example_state(config, env, agent)
-  state = resume.restore(config, run, example, lambda line: None)
+  state = resume.restore_run(config, run, example, lambda line: None).state
   if rewards:
     for name in ("replay", "expert_replay"):
       slots = getattr(state, name).slots

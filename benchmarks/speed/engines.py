@@ -18,9 +18,9 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 
-from apnpql_jax.envs.contact_report import SUBSTEPS
 from apnpql_jax.sim.quiet_mjx import mjx
 from apnpql_jax.tasks import Task, make_task
+from apnpql_jax.tasks.contact_report import SUBSTEPS
 from apnpql_jax.types import Array
 from benchmarks.common import command, timing
 from benchmarks.common.mjx_patching import patched

@@ -25,7 +25,6 @@ from apnpql_jax.agents.learner import make_agent
 from apnpql_jax.config.files import mjcf_path
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.data import replay
-from apnpql_jax.envs.contact_report import SUBSTEPS
 from apnpql_jax.envs.env import make_env
 from apnpql_jax.errors import ConfigError
 from apnpql_jax.sim.engines import make_physics
@@ -33,6 +32,7 @@ from apnpql_jax.sim.physics import initial_state
 from apnpql_jax.sim.quiet_mjx import mjx
 from apnpql_jax.sim.scene import Scene, load_scene
 from apnpql_jax.tasks import make_task
+from apnpql_jax.tasks.contact_report import SUBSTEPS
 from apnpql_jax.training.rollout import example_slot
 from benchmarks.common import command, floor, noise, parts, settings, timing
 from benchmarks.speed import env_steps, learner

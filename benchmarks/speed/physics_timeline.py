@@ -18,10 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from apnpql_jax.envs.contact_report import SUBSTEPS
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.mjx import MjxPhysics
 from apnpql_jax.tasks import make_task
+from apnpql_jax.tasks.contact_report import SUBSTEPS
 from benchmarks.common import command, timing
 from benchmarks.speed.timeline import text_of, traced
 

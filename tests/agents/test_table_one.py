@@ -81,7 +81,7 @@ class Example(NamedTuple):
   agent: Agent
   batch: Transition
   trained: dict[str, Any]
-  slow: dict[str, Any]
+  target_params: dict[str, Any]
   learn: Callable[[Transition], tuple[dict[str, Any], tuple[Array, Metrics]]]
   """Slopes of each loss; total loss and metrics."""
 
@@ -102,22 +102,21 @@ def example_of(name: str, components: int = 1) -> Example:
   )
   trained = {**params, "nu": jnp.float32(NU)}
   # A target network that has fallen behind, as it has in training.
-  slow = jax.tree.map(lambda x: 0.9 * x, params)
+  target_params = jax.tree.map(lambda x: 0.9 * x, params)
+
+  learner = agent.networks, row, agent.policy_evaluation
 
   def losses(trained, batch):
-    target = bellman_target(
-      agent.networks, row, agent.policy_evaluation, slow, batch, jax.random.key(1)
-    )
-    total, metrics = total_loss(
-      agent.networks, row, agent.policy_evaluation, trained, slow, batch, target, KEY
-    )
+    target = bellman_target(*learner, target_params, batch, jax.random.key(1))
+    total, metrics = total_loss(*learner, trained, target_params, batch, target, KEY)
     parts = {k: v for k, v in metrics.items() if k.startswith("loss/")}
     return parts, (total, metrics)
 
   with jax.numpy_rank_promotion("raise"):
     learn = jax.jit(jax.jacrev(losses, has_aux=True))
     learn(trained, batch)
-  return Example(agent, batch, trained, slow, functools.partial(learn, trained))
+  learn = functools.partial(learn, trained)
+  return Example(agent, batch, trained, target_params, learn)
 
 
 def touched(slope: dict) -> set[str]:
@@ -185,9 +184,9 @@ def test_a_new_run_may_change_what_its_row_has(name: str):
   check_effects(changed({"algorithm": name, **own}, true_primitives=True))
 
 
-def regularizer_of(name: str, heads: Heads, slow: Heads) -> ActionDistribution:
+def regularizer_of(name: str, heads: Heads, target_heads: Heads) -> ActionDistribution:
   kinds = {"b": heads.prior, "uniform": lambda: UniformBox((BATCH,), 6)}
-  return {**kinds, "past": slow.policy}[COLUMNS[name].regularizer]()
+  return {**kinds, "past": target_heads.policy}[COLUMNS[name].regularizer]()
 
 
 def log_prob(distribution: ActionDistribution, actions: Array) -> np.ndarray:
@@ -233,7 +232,7 @@ def of_good(heads: Heads, actions: Array, key: Array):
 def test_losses_are_those_of_the_candidates_that_the_row_names(name: str):
   example, columns = example_of(name), COLUMNS[name]
   heads, (_, metrics) = example.heads(example.trained), example.learn(example.batch)[1]
-  prior = regularizer_of(name, heads, example.heads(example.slow))
+  prior = regularizer_of(name, heads, example.heads(example.target_params))
   entropy = prior.entropy_bound()
   assert metrics["prior/entropy"] == pytest.approx(float(entropy.mean()), rel=1e-4)
   expected = {}
@@ -299,7 +298,8 @@ def test_values_are_learned_as_the_row_defines(name: str):
 
 def test_past_policy_is_that_of_the_target_network():
   example = example_of("mpo")
-  heads, slow = example.heads(example.trained), example.heads(example.slow)
-  past = regularizer.previous_policy(heads, slow)
-  jax.tree.map(np.testing.assert_array_equal, past, slow.policy())
+  heads = example.heads(example.trained)
+  target_heads = example.heads(example.target_params)
+  past = regularizer.previous_policy(heads, target_heads)
+  jax.tree.map(np.testing.assert_array_equal, past, target_heads.policy())
   assert np.all(np.abs(past.loc - heads.policy().loc).max((1, 2)) > 1e-3)

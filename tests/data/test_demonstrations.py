@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from apnpql_jax import testing
 from apnpql_jax.cli import main
-from apnpql_jax.data import demonstrations, real_arm
+from apnpql_jax.data import demonstrations, recordings
 from apnpql_jax.data.demonstrations import Demonstrations
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.errors import UserError
@@ -359,7 +359,7 @@ def _recording(
 
 def _convert(path: Path, env: Env, recording: dict[str, Any]) -> Demonstrations:
   np.savez(path, **recording)
-  return real_arm.convert(path, env.task.scene, period_s=0.15)
+  return recordings.convert(path, env.task.scene, period_s=0.15)
 
 
 def test_a_recording_becomes_the_demonstrations_it_was_made_of(tmp_path, demos, env):

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from apnpql_jax.data import demonstrations, real_arm
+from apnpql_jax.data import demonstrations, recordings
 from apnpql_jax.errors import FileError
 from apnpql_jax.sim.engines import make_physics
 from apnpql_jax.sim.physics import initial_state
@@ -121,7 +121,7 @@ def recording(scene: Scene) -> dict[str, Any]:
 
 def convert(folder: Path, scene: Scene, arrays: dict[str, Any]):
   np.savez(folder / "recording.npz", **arrays)
-  return real_arm.convert(folder / "recording.npz", scene, period_s=PERIOD_S)
+  return recordings.convert(folder / "recording.npz", scene, period_s=PERIOD_S)
 
 
 def test_a_recording_moves_drawer_and_door(scene, tmp_path):

@@ -193,7 +193,7 @@ def _save(run: Path, built: Built, *states: tuple[TrainState, bool]) -> None:
 def test_a_saved_state_continues_bit_for_bit(built, iteration, tmp_path):
   _save(tmp_path, built, (built.state, True))
   example = jax.eval_shape(lambda: jax.tree.map(jnp.copy, built.state))
-  restored = resume.restore(built.config, tmp_path, example, pytest.fail)
+  restored = resume.restore_run(built.config, tmp_path, example, pytest.fail).state
   straight = built.state
   # Otherwise the first resume would compile the iteration again.
   assert all(x.committed for x in jax.tree.leaves(restored))
@@ -213,7 +213,7 @@ def test_an_episode_excluded_after_it_was_saved_stays_excluded(built, tmp_path):
   old, new = checkpoint_record.read_all(tmp_path).values()
   assert old.segments == new.segments and old.segments
   example = jax.eval_shape(lambda: jax.tree.map(jnp.copy, after))
-  restored = resume.restore(built.config, tmp_path, example, pytest.fail)
+  restored = resume.restore_run(built.config, tmp_path, example, pytest.fail).state
   assert _bits(restored) == _bits(after)
 
 
@@ -225,7 +225,7 @@ def test_a_state_saved_without_replay_continues_with_an_older_one(
   assert checkpoint_reader.all_steps(tmp_path) == [24, 32]
   example = jax.eval_shape(lambda: jax.tree.map(jnp.copy, after))
   warnings: list[str] = []
-  restored = resume.restore(built.config, tmp_path, example, warnings.append)
+  restored = resume.restore_run(built.config, tmp_path, example, warnings.append).state
   assert warnings == ["its replay comes from step 24"]
   assert _bits(restored.replace(replay=None)) == _bits(after.replace(replay=None))
   assert int(restored.replay.cursor) == int(before.replay.cursor)

@@ -75,7 +75,7 @@ def save_and_restore() -> None:
     found["saved"] = settled()
     del state, writer
     found["dropped"] = settled()
-    restored = resume.restore(config, run, example, print)
+    restored = resume.restore_run(config, run, example, print).state
     found["restoring"], _ = memory(os.getpid())
     found["restored"] = settled()
     assert int(restored.env_steps) == CAPACITY + 2 * testing.STEPS

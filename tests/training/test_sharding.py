@@ -113,7 +113,7 @@ def compare(backend: str) -> None:
       writer.save(1, resume.to_items(state, whole=True), rings=rings)
     for key, place in (("four", several), ("one", alone)):
       example = example_state(config, place, agent)
-      found = resume.restore(config, run, example, print)
+      found = resume.restore_run(config, run, example, print).state
       same = leaves.checksums(found) == leaves.checksums(state)
       result[f"resumed_on_{key}"] = same and jax.tree.map(
         lambda x: x.sharding, found

@@ -39,7 +39,7 @@ class Improvement(struct.PyTreeNode):
   """Losses by name."""
 
 
-def none(heads: Heads, prior: ActionDistribution, key: PRNGKeyArray) -> Improvement:
+def keep_q(heads: Heads, prior: ActionDistribution, key: PRNGKeyArray) -> Improvement:
   """Keeps q as the policy; trains only alpha, by the dual of its KL limit (Eq. 7)."""
   config = heads.config
   q = non_parametric(heads, prior, key, num_samples=config.policy_samples)
@@ -57,7 +57,7 @@ def forward_kl(
   proportion to its responsibility for it, as in a gradient step of EM. The step of pi
   has no limit of its own, neither on the means nor on the covariances.
   """
-  step = none(heads, prior, key)
+  step = keep_q(heads, prior, key)
   q, policy = step.candidates, heads.policy()
   fit = losses.weighted_nll(policy, q.samples, q.weights)
   terms = {**step.losses, "loss/policy": fit}

@@ -19,21 +19,21 @@ from apnpql_jax.types import ARM_DOF, Array, Transition
 Losses = dict[str, Float[Array, "*b"]]
 
 
-def behavior_prior(heads: Heads, slow: Heads) -> GripperGMM:
+def behavior_prior(heads: Heads, target_heads: Heads) -> GripperGMM:
   """Returns b_theta, a mixture around predicted action primitives (Sec. IV-A)."""
-  del slow
+  del target_heads
   return heads.prior()
 
 
-def previous_policy(heads: Heads, slow: Heads) -> GripperGMM:
+def previous_policy(heads: Heads, target_heads: Heads) -> GripperGMM:
   """Returns pi_{k-1}, the policy of the target network, a slow average of psi."""
   del heads
-  return slow.policy()
+  return target_heads.policy()
 
 
-def uniform(heads: Heads, slow: Heads) -> UniformBox:
+def uniform(heads: Heads, target_heads: Heads) -> UniformBox:
   """Returns the uniform distribution over the action box."""
-  del slow
+  del target_heads
   return UniformBox(heads.phi.shape[:-1], ARM_DOF)
 
 

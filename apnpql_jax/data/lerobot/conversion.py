@@ -8,7 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from apnpql_jax.data import demonstrations, real_arm
+from apnpql_jax.data import demonstrations, recordings
 from apnpql_jax.data.demonstrations import Demonstrations
 from apnpql_jax.data.lerobot.layout import ENVIRONMENT, TIMES
 from apnpql_jax.data.lerobot.reader import Dataset, Episode, read
@@ -46,7 +46,7 @@ def convert(folder: Path, scene: Scene, *, period_s: float) -> Demonstrations:
   A dataset with whole states, as ``apnpql collect`` writes it, gives the demonstrations
   that it was made from. So does the log of a simulated robot; where its policy was late
   and dropped a period, a new episode begins. One with poses only is converted like a
-  recording, see ``real_arm``.
+  recording, see ``recordings``.
 
   Raises:
     FileError: The folder is no dataset, is damaged, holds no poses of the objects, or
@@ -118,7 +118,7 @@ def _begins(times: np.ndarray, period_s: float) -> np.ndarray:
 
 def _from_poses(dataset: Dataset, scene: Scene, period_s: float) -> Demonstrations:
   """Returns demonstrations from joint angles and poses of objects."""
-  bodies, joints = real_arm.tracked(scene)
+  bodies, joints = recordings.tracked(scene)
   known = dataset.names[ENVIRONMENT]
   arrays = {
     "time": np.concatenate([_times(dataset, x) for x in dataset.episodes]),
@@ -141,7 +141,7 @@ def _from_poses(dataset: Dataset, scene: Scene, period_s: float) -> Demonstratio
     if set(wanted) <= set(known):
       values = _column(dataset, wanted)
       arrays[name] = values if name in bodies else values[:, 0]
-  return real_arm.convert_arrays(arrays, scene, period_s=period_s)
+  return recordings.convert_arrays(arrays, scene, period_s=period_s)
 
 
 def _column(dataset: Dataset, names: list[str]) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from apnpql_jax.sim import engines, physics
 from apnpql_jax.sim.mjx import contact_slots
-from apnpql_jax.tasks import Task
+from apnpql_jax.tasks.task import Task
 
 WORLDS = 64
 SUBSTEPS = 30  # physics steps per timed call: one control period of 0.15 s at 5 ms

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from apnpql_jax.cli.main import _show
-from apnpql_jax.envs.contact_report import contact_report
 from apnpql_jax.tasks import make_task, task_names
+from apnpql_jax.tasks.contact_report import contact_report
 
 PLANE, SPHERE, CAPSULE, BOX = (
   int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))
