@@ -9,7 +9,7 @@ import numpy as np
 
 
 class Texture(NamedTuple):
-  """By what the texture of a geom multiplies its color; a plain one by its mean."""
+  """Factors on a geom's color: two for a checker, else the texture's mean twice."""
 
   edge: float  # of a checker's squares, m; 0 for any other texture
   even: np.ndarray  # f64[3]: of squares where floor(x) + floor(y) is even

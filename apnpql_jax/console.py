@@ -47,7 +47,7 @@ def print_line(line: str) -> None:
 
 @contextlib.contextmanager
 def reporting(purpose: str) -> Generator[None, None, None]:
-  """Prints one line instead of raising: a report must not cost what it is about."""
+  """Prints an error in one line instead of raising it: a report must not stop a run."""
   try:
     yield
   except Exception as error:  # Whatever the libraries of the report raise.

@@ -33,10 +33,10 @@ _UNSUPPORTED = {
 MIN_THREADS = 4  # XLA:CPU threads per emulated device, which share a pool
 # Operations that XLA:CPU runs in the library YNNPACK; its default adds "REDUCE".
 KEPT_FUSIONS = "INDIVIDUAL_CONVOLUTION", "INDIVIDUAL_DOT"
-# The flag and the jaxlib versions that have it; XLA aborts on unknown flags.
-_JAX_DEFAULTS = None, 1.0  # of the settings below
+_JAX_DEFAULTS = None, 1.0  # of the settings in ``configure``
 _MEMINFO = Path("/proc/meminfo")
-_CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
+_CGROUP = Path("/sys/fs/cgroup")
+# The flag and the jaxlib versions that have it; XLA aborts on unknown flags.
 _FLAG, _FLAG_VERSIONS = "xla_cpu_experimental_ynn_fusion_type", r"0\.1[01]\."
 
 
@@ -191,7 +191,7 @@ def cores() -> int:
 
 def host_memory() -> int | None:
   """Returns the bytes of RAM that this process may still use; None if unknown."""
-  bounds = [b for b in (_free_memory(), _container_limit()) if b is not None]
+  bounds = [b for b in (_free_memory(), _left_in_container()) if b is not None]
   return min(bounds, default=None)
 
 
@@ -205,7 +205,11 @@ def _free_memory() -> int | None:
   return None
 
 
-def _container_limit() -> int | None:
-  with contextlib.suppress(OSError, ValueError):  # No limit, or "max".
-    return int(_CGROUP_LIMIT.read_text())
+def _left_in_container() -> int | None:
+  with contextlib.suppress(OSError, KeyError, ValueError):  # No limit, or "max".
+    limit = int((_CGROUP / "memory.max").read_text())
+    used = int((_CGROUP / "memory.current").read_text())
+    lines = (_CGROUP / "memory.stat").read_text().splitlines()
+    cached = int(dict(line.split() for line in lines)["inactive_file"])
+    return max(limit - used + cached, 0)  # The kernel frees what it has only cached.
   return None

@@ -214,3 +214,14 @@ def test_quiet_warp_passes_errors_through(capsys):
     print("a hint")
     raise ImportError
   assert capsys.readouterr().out == "a hint\n"
+
+
+def test_a_container_leaves_what_it_does_not_use(tmp_path, monkeypatch):
+  """Cached files count as free, since the kernel drops them first."""
+  monkeypatch.setattr(runtime, "_CGROUP", tmp_path)
+  (tmp_path / "memory.current").write_text("12000000\n")
+  (tmp_path / "memory.stat").write_text("anon 9000000\ninactive_file 3000000\n")
+  (tmp_path / "memory.max").write_text("16000000\n")
+  assert runtime.host_memory() == 7_000_000
+  (tmp_path / "memory.max").write_text("max\n")
+  assert (runtime.host_memory() or 0) > 7_000_000

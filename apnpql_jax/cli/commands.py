@@ -281,7 +281,7 @@ def _check_demonstrations(path: Path, *, overwrite: bool, append: bool) -> None:
   if overwrite and append:
     raise ConfigError("use either --append or --overwrite")
   if path.is_dir() or not path.absolute().parent.is_dir():
-    raise ConfigError(f"{path} is a folder, or in none; name a file to write")
+    raise ConfigError(f"{path} is a folder or its parent is missing; name another file")
   check_writable(path.absolute().parent)
   check_free(path, overwrite=overwrite or append)
 

@@ -34,7 +34,7 @@ class Export(OfRun):
   """Checkpoint: newest, best (highest success rate in training) or its step."""
 
   acting: Acting = None
-  """How to choose an action, see `apnpql evaluate --help`. Only mean needs no key."""
+  """How to choose an action, see `apnpql evaluate --help`."""
 
   overwrite: Flag = False
   """Replace an earlier export."""

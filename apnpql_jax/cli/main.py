@@ -34,9 +34,10 @@ from apnpql_jax.runs.signals import Signals
 def main(argv: Sequence[str] | None = None) -> int:
   """Runs one command line and returns its exit code.
 
-  0 is success, 1 a machine that `doctor` finds unfit, 2 bad input, 3 a run that had to
-  stop (disk full, non-finite updates), 129 a closed terminal, 130 Ctrl-C and 143
-  SIGTERM, with the run saved. All but 0 and 1 print one line to stderr.
+  0 is success, 1 a machine that `doctor` finds unfit, 2 bad input or a failed row of
+  `robot check`, 3 a run that had to stop (disk full, non-finite updates), 129 a closed
+  terminal, 130 Ctrl-C and 143 SIGTERM; `train` and `sweep` save their runs first. All
+  but 0 and 1 print one line to stderr.
   """
   _fill_closed_streams()
   args = list(sys.argv[1:] if argv is None else argv)

@@ -140,8 +140,8 @@ class _HeldOut(OfRun):
   draws from b without Q; greedy takes the highest Q."""
 
   bank_seed: int = 0
-  """Seed of the states that episodes start from. Another than 0 draws states on which
-  nothing was trained or chosen."""
+  """Seed of the states that episodes start from. Seeds other than 0 draw states on
+  which nothing was trained or selected."""
 
   backend: AsTrained = None
   """Physics engine: auto, mjx or native."""
@@ -194,8 +194,8 @@ class Collect(_Play):
   """Standard deviation of the noise on the expert's joint velocities (rad/s)."""
 
   save: File = None
-  """Also record as many episodes, started from training resets, to this demonstrations
-  file, or folder of a dataset."""
+  """Also record the same number of episodes, started from training resets, to this
+  demonstrations file or dataset folder."""
 
   format: str = "npz"
   """Format of --save: npz (demonstrations for training) or lerobot (a dataset with
@@ -235,7 +235,7 @@ class Convert(Command):
   """Keep only solved episodes."""
 
   allow_unsolved: Flag = False
-  """Write a file of which no episode is solved."""
+  """Write the file even if no episode in it is solved."""
 
   overwrite: Flag = False
   """Replace the file if it exists."""

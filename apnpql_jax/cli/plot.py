@@ -66,4 +66,4 @@ def check_output(path: Path) -> None:
   check_utf8(path)
   check_writable(path.absolute().parent)
   if path.is_dir() or not path.absolute().parent.is_dir():
-    raise ConfigError(f"{path} is a folder, or in none; name a file to write")
+    raise ConfigError(f"{path} is a folder or its parent is missing; name another file")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from pathlib import Path
 import sys
@@ -14,6 +15,12 @@ from apnpql_jax.errors import ConfigError, check_name
 
 AsDefault = Annotated[str | None, default_hint("")]
 ACTIONS = ("check", "calibrate", "run")
+
+_OPTIONS = {
+  "calibrate": ("views", "recorded", "board", "print_board", "board_on", "overwrite"),
+  "run": ("episodes", "seed", "log", "replay", "latency_ms", "yes"),
+}
+"""Options that only one action takes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,22 +158,33 @@ def _calibrate(args: Robot, opened: Any) -> dict[str, Any]:
   if (out := opened.cell.calibration) is None:
     raise ConfigError("only the cameras of --robot ur5e need a calibration")
   from apnpql_jax.robot.calibration import boards, live
+  from apnpql_jax.robot.calibration.command import calibrate
 
-  return live.calibrate_cell(
-    opened.contract,
-    args.views,
-    out,
-    host=opened.cell.arm_host,
-    serials=opened.cell.cameras,
-    recorded=args.recorded,
-    board=boards.Board().text if args.board is None else args.board,
-    board_on=args.board_on,
-    overwrite=args.overwrite,
-  )
+  contract, serials = opened.contract, opened.cell.cameras
+  devices = contextlib.nullcontext((None, None))
+  if not args.recorded:
+    devices = live.opened(contract, opened.cell.arm_host, serials)
+  with devices as (arm, cameras):
+    return calibrate(
+      contract,
+      args.views,
+      out,
+      board=boards.Board().text if args.board is None else args.board,
+      board_on=args.board_on,
+      arm=arm,
+      cameras=cameras,
+      serials=serials,
+      overwrite=args.overwrite,
+    )
 
 
 def _check_options(args: Robot) -> None:
-  """Raises ``ConfigError`` for values that no robot takes."""
+  """Raises ``ConfigError`` for values that no robot takes, or another action does."""
+  defaults = Robot()
+  for action, names in _OPTIONS.items():
+    for name in names:
+      if action != args.action and getattr(args, name) != getattr(defaults, name):
+        raise ConfigError(f"--{name.replace('_', '-')} is for robot {action}")
   if args.episodes < 1 or not 0 <= args.seed < 2**32:
     raise ConfigError("--episodes must be at least 1 and --seed from 0 to 2^32 - 1")
   if not 0 <= args.latency_ms <= 500 or not 0.1 <= args.slowdown <= 100:

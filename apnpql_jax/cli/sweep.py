@@ -114,7 +114,7 @@ def config_of(argv: Sequence[str]) -> TrainConfig:
 
 
 def _options_of(argv: Sequence[str]) -> Train:
-  """Returns what ``config_of`` does, as the same options if runs are the same."""
+  """Returns the checked options of a run; equal options mean the same run."""
   named = Train(preset=argv[0], task_file=user_files.task_file(argv))
   base = Train(config=commands.base_config(named))
   args = parse(Train, "train", argv, default=base)
@@ -135,7 +135,9 @@ def _open(args: Sweep, stack: contextlib.ExitStack) -> Manifest:
     return states.load(args.resume)
   if not args.presets:
     names = ", ".join(files.preset_names())
-    raise ConfigError(f"sweep needs a preset; choose from {names}")
+    raise ConfigError(
+      f"sweep needs a preset, before the options of train; choose from {names}"
+    )
   plan = make_plan(args.presets, args.grid, seeds=args.seeds, options=args.train)
   check_plan(plan)
   folder = args.out or states.find_equal(_ROOT, plan)
@@ -171,7 +173,7 @@ def check_plan(plan: Sequence[Planned]) -> None:
   """Checks the options of all runs of a plan.
 
   Raises:
-    ConfigError: Those of a run cannot be meant, or two runs are the same.
+    ConfigError: The options of a run are invalid, or two runs are the same.
   """
   names: dict[Train, str] = {}
   for run in plan:
@@ -196,7 +198,7 @@ def _checked(run: Planned) -> Train:
 def launch_of(args: Sweep, stored: Launch) -> Launch:
   """Returns how to start runs: as the options say, else as the sweep stores it.
 
-  Another launcher takes nothing from the one before.
+  A different launcher keeps none of the stored settings.
 
   Raises:
     ConfigError: The launcher has no such settings.

@@ -89,6 +89,8 @@ def transfer(args: Transfer) -> dict[str, Any]:
   expert = args.run == EXPERT and not Path(EXPERT, "config.json").exists()
   if expert != bool(args.task):
     raise ConfigError("--task names the task of the expert; runs have their own")
+  if expert and (args.acting is not None or args.checkpoint != "newest"):
+    raise ConfigError("--acting and --checkpoint need a run folder")
   check_free(args.video, overwrite=args.overwrite)
   env_config = task_env(args.task) if expert else None
   if env_config is None:

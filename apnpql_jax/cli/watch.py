@@ -59,7 +59,7 @@ class Watch(OfRun):
   """Address to serve at; by default only this machine can connect."""
 
   port: int = 8080
-  """Port to serve at; if it is taken, the next free one."""
+  """Port to serve on; if it is taken, the next free one is used."""
 
   video: File = None
   """Write a video to this .mp4 or .gif file instead."""
@@ -79,7 +79,7 @@ def watch(args: Watch) -> Json:
   if scripted == (not args.task):
     raise ConfigError("--task goes with expert and random, and only with them")
   if not 0 < args.port < 65536:
-    raise ConfigError(f"port={args.port} must be from 1 to 65535")
+    raise ConfigError(f"--port {args.port} must be from 1 to 65535")
   check_free(args.video, overwrite=args.overwrite)
   if not scripted:
     run_config(Path(args.what), args.task_file)

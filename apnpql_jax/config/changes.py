@@ -66,7 +66,7 @@ def _fixed(saved: TrainConfig, wanted: TrainConfig) -> dict[str, tuple[Any, Any]
 
 
 def weights_diff(saved: TrainConfig, wanted: TrainConfig) -> dict[str, Any]:
-  """Returns those differences because of which weights may not fit.
+  """Returns the differences that may prevent the weights from fitting.
 
   The observed object points, and so the first layer, are those of the task.
   """

@@ -73,9 +73,10 @@ PROCESS_BYTES = 9 << 28
 MiB for a checkpoint. `benchmarks.reliability.memory` measures it."""
 
 _PRIMITIVE_BYTES = 4 * 3 * 7
-_OTHER_BYTES = 4 * (21 + 3 + 7 + 2) + _PRIMITIVE_BYTES + 2
-"""Bytes of a slot without images: robot state, tool, action, primitive labels, reward
-and log density of the action (f32), and the two end flags."""
+_OTHER_BYTES = 4 * (21 + 3 + 7 + 7 + 2) + _PRIMITIVE_BYTES + 2
+"""Bytes of a slot without images: robot state, tool, action, the expert's action (only
+where it is imitated), primitive labels, reward and log density of the action (f32), and
+the two end flags."""
 
 
 def validate(

@@ -30,7 +30,12 @@ _NAME = re.compile(r"[a-z][a-z0-9_]*")
 
 def preset_names() -> list[str]:
   """Returns the sorted names of the presets without executing them."""
-  return sorted({*_names("experiments", ".py"), *_installed()})
+  return sorted({*own_preset_names(), *_installed()})
+
+
+def own_preset_names() -> list[str]:
+  """Returns the names of the presets of this package."""
+  return _names("experiments", ".py")
 
 
 def is_preset(name: str) -> bool:
@@ -52,8 +57,7 @@ def load_preset(name: str) -> TrainConfig:
     module = user_files.load(name)
     return with_file(module, _checked(name, getattr(module, "CONFIG", None)))
   check_name("preset", name, preset_names())
-  own = _names("experiments", ".py")
-  if name in own:
+  if name in own_preset_names():
     module = user_files.load(_folder("experiments") / f"{name}.py")
     return _checked(name, getattr(module, "CONFIG", None))
   try:

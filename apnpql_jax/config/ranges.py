@@ -119,7 +119,7 @@ def check_sizes(ranges: RandomizationConfig) -> None:
   """Checks that all tasks work with the objects of a new run; older runs still load.
 
   Raises:
-    ConfigError: Their range of sizes is too large, or together with that of shapes.
+    ConfigError: The range of sizes is too large, alone or together with that of shapes.
   """
   both = round(ranges.size + ranges.shape, 6)
   if ranges.size > _MAX_SIZE or both > _MAX_SIZE_AND_SHAPE:

@@ -270,7 +270,7 @@ class ReplayConfig:
   """File of demonstrations (docs/demonstrations.md) instead of the scripted expert."""
 
   allow_unsolved: bool = codec.added(False, before=True)
-  """Whether to train on demonstrations of which no episode is solved."""
+  """Whether to train on demonstrations even if no episode in them is solved."""
 
   expert_noise: float = 0.03
   """Standard deviation of the noise on the expert's joint velocities (rad/s); at 0.1
@@ -326,7 +326,7 @@ class TrainConfig:
   """Stop the run after this many consecutive non-finite (skipped) updates."""
 
   video: bool = True
-  """Write a video of evaluation episodes."""
+  """Write a video of the first episodes of the last evaluation."""
 
   sinks: tuple[str, ...] = ()
   """Additional outputs of the metrics: tensorboard, wandb."""

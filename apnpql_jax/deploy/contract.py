@@ -1,4 +1,4 @@
-"""The contract of an exported policy: what surrounds it has to provide and to obey.
+"""The contract of an exported policy: what the code around it must provide and obey.
 
 Everything is read from the compiled scene and the settings of the run, as plain values
 for JSON. Poses are a position in m and a quaternion wxyz. The world has its origin at

@@ -22,7 +22,7 @@ PROGRAM, CONTRACT, EXAMPLE = "policy.bin", "contract.json", "example.py"
 _TEMPLATE = Path(__file__).resolve().parents[1] / "templates" / "use_policy.py"
 
 VERSION = 1
-"""Version of the contract; increased when a reader of the former one would err."""
+"""Version of the contract; it increases if readers of the old one would misread it."""
 
 
 def export(

@@ -42,7 +42,7 @@ def cores() -> Iterator[Finding]:
 
 
 def memory(free: int | None) -> Iterator[Finding]:
-  """Yields for which presets there is too little memory.
+  """Yields for which presets of this package there is too little memory.
 
   ``free`` is the number of bytes on the device that will train; None if unknown.
   """
@@ -52,7 +52,7 @@ def memory(free: int | None) -> Iterator[Finding]:
     return
   wants = {
     name: checks.replay_bytes(files.load_preset(name)) + checks.PROCESS_BYTES
-    for name in files.preset_names()
+    for name in files.own_preset_names()  # Others may import JAX, or fail.
   }
   short = [name for name, needed in wants.items() if needed > free]
   most = max(wants.values())

@@ -4,9 +4,9 @@
     learner.learn(30_720)
     print(success_rate(learner, held_out_worlds("push_plate", 64)))
 
-Its defaults do not learn from a reward that only the end of an episode gives. What is
-added: half of each batch are transitions of the scripted expert, and networks normalize
-their layers (RLPD, Ball et al. 2023); returns of five steps; inputs of order one; a
+With its defaults, SAC does not learn from a reward that comes only at the end of an
+episode. Four things are added: expert transitions as half of each batch, with layer
+normalization (RLPD, Ball et al. 2023); five-step returns; inputs of order one; and a
 policy that starts narrow. The rest is Stable-Baselines3's.
 """
 

@@ -41,8 +41,7 @@ class Group(NamedTuple):
 def group(runs: Sequence[Run]) -> list[Group]:
   """Returns the groups, by task and then in the order in which they are given.
 
-  Runs that repeat the seed of another are no more evidence, so they make groups of
-  their own.
+  Runs that repeat another run's seed add no evidence, so they form groups of their own.
   """
   tasks: dict[str, dict[tuple[Any, ...], list[Run]]] = {}
   seen: Counter[tuple[Any, ...]] = Counter()

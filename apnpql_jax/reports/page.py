@@ -77,7 +77,7 @@ def write(groups: Sequence[Group], path: Path, *, band: str = "interval") -> Non
   """Writes the page; it needs no other file, except for videos that are too large."""
   title = f"Comparison of {', '.join(tasks_of(groups))}"
   runs = [run for group in groups for run in group.runs]
-  found = tables.listed(tables.commits(runs))
+  found = html.escape(tables.listed(tables.commits(runs)))
   differing = tables.of_settings(groups)
   names = {row[0] for row in differing}
   page = _PAGE.substitute(

@@ -103,7 +103,7 @@ def read(folder: Path) -> Run:
     load_run_config(folder),
     evaluations,
     _final(folder / EVALUATION_FILE, evaluations),
-    _json(folder / "versions.json") or {},
+    _versions(folder / "versions.json"),
     folder,
   )
 
@@ -112,6 +112,15 @@ def is_finished(folder: Path, config: TrainConfig) -> bool:
   """Returns whether a run folder holds a checkpoint of the last step."""
   names = (path.name for path in (folder / "checkpoints").glob("*"))
   return any(int(x) >= config.total_steps for x in names if x.isdecimal())
+
+
+def _versions(path: Path) -> dict[str, Any]:
+  """Returns the versions that a run was started with; none if it has no file."""
+  data = _json(path) or {}
+  match data.get("git"):
+    case None | {"commit": str()}:
+      return data
+  raise FileError(f"{path} is not what a run writes")
 
 
 def _final(path: Path, evaluations: Sequence[Row]) -> dict[str, Any] | None:

@@ -101,11 +101,11 @@ def first_at(run: Run, goal: float, axis: str) -> float | None:
 def interval(
   rates: Float64[np.ndarray, "seeds points"], episodes: Points
 ) -> tuple[Points, Points]:
-  """Returns the lower of two bounds of the mean over seeds, and the higher of two.
+  """Returns the outer bounds of two 95 % intervals of the mean over seeds.
 
-  One pair is the 95 % t-interval over seeds, which takes them as normally distributed
-  and is wide for few of them. It is a single point if all seeds are equal, such as at
-  100 %. The other pair is therefore the Wilson interval of all episodes together.
+  One is the t-interval over seeds. It assumes normally distributed rates and is wide
+  for few seeds, but it is a single point if all seeds are equal, such as at 100 %. The
+  other is therefore the Wilson interval of all episodes together.
 
   Args:
     rates: Success rates in [0, 1].

@@ -150,5 +150,5 @@ def to_goal(run: Run, axis: str) -> str:
 
 def commits(runs: Iterable[Run]) -> list[str]:
   """Returns the commits that the runs were started at, sorted and shortened."""
-  found = {(run.versions.get("git") or {}).get("commit", "")[:7] for run in runs}
-  return sorted(found - {""})
+  found = {git["commit"][:7] for run in runs if (git := run.versions.get("git"))}
+  return sorted(found)

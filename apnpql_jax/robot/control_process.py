@@ -13,11 +13,10 @@ import json
 import math
 from multiprocessing import parent_process
 from multiprocessing.connection import Connection
-import os
 import select
 import sys
 
-from apnpql_jax.robot import devices
+from apnpql_jax.robot import devices, priority
 from apnpql_jax.robot.blackboard import Blackboard, Phase
 from apnpql_jax.robot.clock import Clock
 from apnpql_jax.robot.control import Control
@@ -28,9 +27,6 @@ from apnpql_jax.robot.limits import TIMESTEP
 
 REST_S = 1.0
 """Time that the arm may take to come to rest when the process ends, s."""
-
-REALTIME_PRIORITY = 20
-"""Priority of the process for a real arm, if the system grants it."""
 
 
 def main(
@@ -53,9 +49,9 @@ def main(
   admittance = robot.cell.admittance() if options["admittance"] else None
   core = Core(robot.cell.limits(robot.contract), admittance=admittance)
   try:
+    if robot.kind == "ur5e":
+      priority.ask()  # First: the threads of the drivers inherit it.
     with devices.open_arm(robot) as (arm, gripper):
-      if robot.kind == "ur5e":
-        _ask_for_priority()
       ends = robot.contract["joints"]["gripper"]
       hand = Hand(gripper, open_rad=ends["open_rad"], closed_rad=ends["closed_rad"])
       # Simulated arms have a busy machine, and nothing that they could hit.
@@ -107,8 +103,3 @@ def _last_words(peer: Connection) -> str:
   with contextlib.suppress(EOFError, OSError):
     return str(peer.recv())
   return "policy: its process has ended"
-
-
-def _ask_for_priority() -> None:
-  with contextlib.suppress(OSError, AttributeError):
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(REALTIME_PRIORITY))

@@ -15,8 +15,7 @@ from typing import Any
 from apnpql_jax.errors import ConfigError, UserError, one_line
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
-from apnpql_jax.robot.protocols import Arm, Camera, Device, Gripper, Judge
-from apnpql_jax.robot.supervisor import CAMERAS
+from apnpql_jax.robot.protocols import CAMERAS, Arm, Camera, Device, Gripper, Judge
 
 ROBOTS = ("ur5e", "simulated", "double")
 
@@ -102,7 +101,7 @@ def connected(device: Device) -> Generator[None]:
 
 @contextlib.contextmanager
 def open_cameras(robot: Robot) -> Generator[tuple[Sequence[Camera], Judge | None]]:
-  """Connects the cameras, in the order of ``supervisor.CAMERAS``; see ``open_arm``.
+  """Connects the cameras, in the order of ``protocols.CAMERAS``; see ``open_arm``.
 
   With them comes what judges their scene, if something can.
   """

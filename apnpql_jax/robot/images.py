@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from apnpql_jax.errors import DeviceError
-from apnpql_jax.robot.drivers import vendor
+from apnpql_jax.robot.vendors import opencv
 
 Json = dict[str, Any]
 
@@ -63,7 +63,7 @@ class Preparation:
     Raises:
       DeviceError: The camera sees less than the view, or OpenCV is missing.
     """
-    self._cv2 = vendor("cv2", "opencv-contrib-python-headless")
+    self._cv2 = opencv()
     self._size = view["height"], view["width"]
     inner = view["intrinsics_px"]
     # As many samples per pixel of the view as the camera has pixels there.

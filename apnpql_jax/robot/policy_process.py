@@ -27,10 +27,9 @@ from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.orders import comes_true
 from apnpql_jax.robot.player import Act, Player
 from apnpql_jax.robot.policy_folder import PolicyFolder
-from apnpql_jax.robot.protocols import Camera
+from apnpql_jax.robot.protocols import CAMERAS, Camera
 from apnpql_jax.robot.recorder import Recorder
-from apnpql_jax.robot.replay import recorded_actions
-from apnpql_jax.robot.supervisor import CAMERAS
+from apnpql_jax.robot.replay import recorded_actions, replaying
 
 END_S = 60.0
 """Time to write an interrupted episode after the end of the control process, s."""
@@ -65,19 +64,6 @@ def load_program(folder: PolicyFolder, seed: int) -> Act:
   def act(observation: dict[str, np.ndarray], episode: int, instant: int) -> np.ndarray:
     key = np.array([seed, episode * 100_000 + instant], np.uint32)
     return np.asarray(call(observation, key))[0]
-
-  return act
-
-
-def replaying(actions: Sequence[np.ndarray]) -> Act:
-  """Returns a policy that repeats recorded episodes; then it stands still."""
-
-  def act(observation: dict[str, np.ndarray], episode: int, instant: int) -> np.ndarray:
-    del observation
-    recorded = actions[episode % len(actions)]
-    if instant < len(recorded):
-      return np.asarray(recorded[instant])
-    return np.append(np.zeros(6), recorded[-1][6])
 
   return act
 

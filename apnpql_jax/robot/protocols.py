@@ -13,6 +13,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+CAMERAS = ("global", "wrist")
+"""Names of the cameras in the contract, in the order of all lists of cameras."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ArmState:

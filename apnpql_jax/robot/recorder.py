@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from apnpql_jax.data import lerobot
-from apnpql_jax.robot.protocols import Frame
-from apnpql_jax.robot.supervisor import CAMERAS
+from apnpql_jax.robot.protocols import CAMERAS, Frame
 
 ROBOT_TYPE = "ur5e_rh_p12_rn"
 _COMMAND = "observation.command"

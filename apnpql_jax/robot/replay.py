@@ -6,6 +6,7 @@ contract of the policy in whose place it acts.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from apnpql_jax.data import lerobot
 from apnpql_jax.errors import FileError
+from apnpql_jax.robot.player import Act
 
 Json = dict[str, Any]
 
@@ -42,6 +44,19 @@ def recorded_actions(folder: Path, contract: Json) -> list[np.ndarray]:
   if difference:
     raise FileError(f"{str(folder)!r} cannot be replayed: {difference}")
   return actions
+
+
+def replaying(actions: Sequence[np.ndarray]) -> Act:
+  """Returns a policy that repeats recorded episodes; then it stands still."""
+
+  def act(observation: dict[str, np.ndarray], episode: int, instant: int) -> np.ndarray:
+    del observation
+    recorded = actions[episode % len(actions)]
+    if instant < len(recorded):
+      return np.asarray(recorded[instant])
+    return np.append(np.zeros(6), recorded[-1][6])
+
+  return act
 
 
 def _difference(dataset: Any, contract: Json) -> str:

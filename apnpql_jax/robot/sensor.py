@@ -36,9 +36,17 @@ def load(wrench: np.ndarray) -> float:
 class Sensor:
   """A simulated sensor with an offset and noise; wrenches are f64[6], N and N m."""
 
-  def __init__(self, rng: np.random.Generator) -> None:
-    """Draws the offset that the sensor has before its first zero."""
-    self._rng = rng
+  def __init__(
+    self, rng: np.random.Generator, *, error: float = 1.0, noise: float = 1.0
+  ) -> None:
+    """Draws the offset that the sensor has before its first zero.
+
+    Args:
+      rng: Generator of errors and noise.
+      error: Largest error of an axis, in accuracies.
+      noise: Standard deviation of the noise, in multiples of ``NOISE``.
+    """
+    self._rng, self._most, self._noise = rng, error, noise * NOISE
     self._offset = POWER_ON * self._error()
 
   def zero(self, wrench: np.ndarray) -> None:
@@ -51,8 +59,9 @@ class Sensor:
 
   def read(self, wrench: np.ndarray) -> np.ndarray:
     """Returns a reading of the true ``wrench``."""
-    return wrench + self._offset + NOISE * self._rng.normal(size=6)
+    return wrench + self._offset + self._noise * self._rng.normal(size=6)
 
   def _error(self) -> np.ndarray:
     """Returns an error drawn uniformly from within the accuracy."""
-    return np.repeat([FORCE_ACCURACY, TORQUE_ACCURACY], 3) * self._rng.uniform(-1, 1, 6)
+    most = self._most * np.repeat([FORCE_ACCURACY, TORQUE_ACCURACY], 3)
+    return most * self._rng.uniform(-1, 1, 6)

@@ -13,9 +13,7 @@ import enum
 import numpy as np
 
 from apnpql_jax.robot.limits import Limits
-from apnpql_jax.robot.protocols import ArmState, GripperState
-
-CAMERAS = ("global", "wrist")
+from apnpql_jax.robot.protocols import CAMERAS, ArmState, GripperState
 
 NO_ACTION = "policy: no action yet"
 """Reason of the hold with which each episode begins."""

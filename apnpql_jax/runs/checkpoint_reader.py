@@ -68,8 +68,8 @@ def restore(
   """Restores items of a checkpoint with the exact bits that were saved.
 
   An item that the checkpoint lacks comes from the newest earlier one that holds it.
-  Without ``examples``, only rejects checkpoints that cannot be restored, which needs
-  nothing but their records.
+  With empty ``examples``, it reads only the records and rejects checkpoints that cannot
+  be restored.
 
   Args:
     run_dir: The run folder.
@@ -81,8 +81,8 @@ def restore(
       resumed run may change; not checked if None.
     partly: The pytrees are nested dicts of some arrays of the items, none of which is
       in segments. The others are not read.
-    without_segments: If no checkpoint is intact, return the newest one of which all but
-      some segments is.
+    without_segments: If no checkpoint is intact, return the newest one in which only
+      segments are damaged.
 
   Raises:
     FileError: There is no such checkpoint, it belongs to another configuration or

@@ -181,8 +181,8 @@ def read_rows(path: Path, *, having: str = "", skip_damaged: bool = False) -> li
         continue
       try:
         row = json.loads(line)
-        row[STEP] + 0
-      except (ValueError, TypeError, KeyError):
+        row[STEP] + sum(x for x in row.values() if x is not None)
+      except (ValueError, TypeError, KeyError, AttributeError):
         if skip_damaged:
           continue
         raise FileError(f"{path}, line {number}: not a row of metrics") from None

@@ -19,19 +19,19 @@ from apnpql_jax.runs import provenance, signals
 from apnpql_jax.runs.text import read_text, write_text
 
 CONFIG_FILE = "config.json"
-"""Its presence makes a folder a run folder."""
+"""A folder that holds this file is a run folder."""
 
 _MAX_CONFIG_BYTES = 1 << 20
 
 _PATTERN = "*?[]\\"
-"""Characters that Orbax takes for patterns, so that it would find no file or others."""
+"""Characters that Orbax reads as patterns: it would find no file, or the wrong one."""
 
 
 class RunFolder(NamedTuple):
   """A run folder that exists and holds ``config.json``."""
 
   path: Path  # absolute
-  config: TrainConfig  # that the run was started with
+  config: TrainConfig  # as it is now; a resume may have changed it
 
 
 def create(
@@ -82,9 +82,8 @@ def create(
     shutil.rmtree(new, ignore_errors=True)
     raise FileError(f"cannot make run folder {str(run_dir)!r}: {error}") from None
   with contextlib.suppress(OSError):
-    (
-      old / CONFIG_FILE
-    ).unlink()  # From now on it is no run, however long the rest takes.
+    # First: without it, the old folder is no run, however long its removal takes.
+    (old / CONFIG_FILE).unlink()
   shutil.rmtree(old, ignore_errors=True)
   return RunFolder(run_dir, config)
 
@@ -180,7 +179,7 @@ def _removed_if_empty(folder: Path) -> Generator[None, None, None]:
 def load_run_config(
   run_dir: Path, warn: Callable[[str], None] | None = None
 ) -> TrainConfig:
-  """Returns the configuration that a run was started with.
+  """Returns the configuration of a run as it is now.
 
   Calls ``warn`` with one line that lists the settings that the run predates, if any.
 

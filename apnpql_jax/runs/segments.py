@@ -95,7 +95,7 @@ class SegmentWriter:
     """Folders of the segments written since ``begin``."""
 
   def begin(self, rings: Mapping[str, Ring]) -> None:
-    """Plans to write the parts that have changed, those first that will change next."""
+    """Plans to write the changed parts, first those that will change again soonest."""
     self.segments, self.written, self._parts = [], [], []
     for name, ring in rings.items():
       new = ring.added - self._added.get(name, 0)

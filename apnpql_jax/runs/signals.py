@@ -1,7 +1,8 @@
 """Signals that stop a run: when to finish and save, and when to end at once.
 
-Python runs signal handlers between two instructions, and a compilation or a save is one
-that takes minutes. A thread therefore watches for signals that end the process at once.
+Python runs signal handlers only between bytecode instructions, and a compilation or a
+save is one instruction that takes minutes. A thread therefore watches for the signals
+that end the process at once.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from typing import Any
 from apnpql_jax.errors import INTERRUPTED
 
 EMPTY_FOLDERS: set[Path] = set()
-"""Folders that a process which is ended at once removes, those that are empty."""
+"""Folders to remove, if they are empty, when a signal ends the process at once."""
 
 _ONE_REQUEST_S = 1.0
 """Signals closer than this are one: `timeout` and batch systems send it twice."""
@@ -31,21 +32,22 @@ class Signals:
   Enter it in the main thread. A closed terminal sends SIGHUP. Where that is ignored, as
   under ``nohup``, it stays so.
 
-  A signal ends the process at once, with a line and exit code ``INTERRUPTED`` plus its
-  number, unless ``finish_first`` was called and it is the first.
+  A signal prints a line and ends the process at once, with exit code ``INTERRUPTED``
+  plus its number. After ``finish_first``, the first signal only sets ``caught``.
   """
 
   def __init__(self, message: str):
     """Sets the line that is printed when a signal ends the process."""
     self.caught: list[int] = []
-    self._message, self._patient = message, False
+    self._first: str | None = None
+    self._message = message
 
-  def finish_first(self, message: str) -> None:
-    """Lets the first signal only set ``caught``.
+  def finish_first(self, first: str, second: str) -> None:
+    """Lets the first signal only set ``caught`` and print ``first``.
 
-    The second one prints ``message`` and ends the process.
+    The second one prints ``second`` and ends the process.
     """
-    self._message, self._patient = message, True
+    self._first, self._message = first, second
 
   def __enter__(self) -> Signals:
     self._woken, self._wake = os.pipe()
@@ -74,11 +76,11 @@ class Signals:
       if byte[0] not in self._before:
         continue
       now = time.monotonic()
-      if not self._patient or first is not None and now - first > _ONE_REQUEST_S:
+      if self._first is None or first is not None and now - first > _ONE_REQUEST_S:
         self._end(byte[0])
-      if first is None:
+      elif first is None:
         first = now
-        _write("finishing this iteration, then saving; once more to stop at once")
+        _write(f"{self._first}; once more to stop at once")
     os.close(self._woken)
 
   def _end(self, number: int) -> None:

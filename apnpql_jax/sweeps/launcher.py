@@ -17,7 +17,7 @@ LauncherName = Literal["local", "slurm", "slurm-local"]
 
 @dataclasses.dataclass(frozen=True)
 class Launch:
-  """How a sweep starts its runs, so that a resume starts the others like that."""
+  """How a sweep starts its runs. It is stored, so a resume starts runs the same way."""
 
   launcher: LauncherName = "local"
   slurm: Mapping[str, str | int] = dataclasses.field(default_factory=dict)

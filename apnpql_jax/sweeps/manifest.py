@@ -17,7 +17,7 @@ from apnpql_jax.sweeps.launcher import Launch, LauncherName, Work
 from apnpql_jax.sweeps.plan import Planned
 
 MANIFEST_FILE = "sweep.json"
-"""Its presence makes a folder that of a sweep."""
+"""A folder that holds this file is a sweep folder."""
 
 _FORMAT = 1
 _MAX_BYTES = 64 << 20
@@ -63,7 +63,7 @@ class Manifest:
     return Work(entry.name, entry.argv, self.run_dir(entry), log)
 
   def refresh(self) -> None:
-    """Takes from the run folders what is done; the rest waits, to be started again.
+    """Reads from the run folders which runs are done; all others wait to be started.
 
     Takes jobs and attempts from the file, which another process may have saved since.
     """
@@ -168,7 +168,7 @@ def _entry(data: dict[str, Any]) -> Entry:
   """Returns a run read from JSON.
 
   Raises:
-    ValueError: Its name could lead out of the folder, or its options are no texts.
+    ValueError: Its name could lead out of the folder, or an option is not a string.
   """
   entry = Entry(**data)
   if Path(entry.name).name != entry.name or entry.name in ("", ".", ".."):

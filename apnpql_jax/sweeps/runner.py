@@ -18,7 +18,7 @@ _POLL_S = 0.5
 
 
 class Runner:
-  """Loop over the runs of a sweep, of which one must not cost the others anything."""
+  """Loop over the runs of a sweep. A run that fails must not affect the others."""
 
   def __init__(
     self, manifest: Manifest, launcher: Launcher, report: Callable[[Entry], None]

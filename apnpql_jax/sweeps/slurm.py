@@ -21,7 +21,7 @@ ALL_AT_ONCE = 1_000_000
 """Jobs at the same time, unless the user limits them: the cluster decides."""
 
 DEFAULTS = {"name": "apnpql", "timeout_min": 24 * 60}
-"""Settings of the jobs unless the user gives others; submitit's limit is minutes."""
+"""Default settings of the jobs; submitit's own time limit is only minutes."""
 
 _TIMEOUTS = 1_000_000
 """How often a run may reach the end of its time; submitit's default is 3."""

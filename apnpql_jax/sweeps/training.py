@@ -30,7 +30,10 @@ def train(manifest: Manifest, launcher: Launcher) -> None:
   total = len(manifest.runs)
   print_line(f"sweep folder {folder}; {total} runs")
   with Signals("interrupted") as signals, SweepDisplay(manifest) as display:
-    signals.finish_first(f"stopped at once; runs save by themselves; {hint}")
+    signals.finish_first(
+      "stopping the runs, which save first",
+      f"stopped at once; runs save by themselves; {hint}",
+    )
     Runner(manifest, launcher, display.report).run(signals.caught, display.show)
     with reporting("summarize the sweep"):
       _summarize(manifest, display)

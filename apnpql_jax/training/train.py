@@ -330,7 +330,10 @@ def _loop(
     state, metrics = iteration(state)
     step = int(state.env_steps)
     # Before the report: from then on there is something to save.
-    signals.finish_first(f"stopped at once; to continue: --resume {start.path}")
+    signals.finish_first(
+      "finishing this iteration, then saving",
+      f"stopped at once; to continue: --resume {start.path}",
+    )
     rings = to_rings(state, chunk=config.rollout_length)
     metrics = {**metrics, **saver.proceed(rings)}
     if reporter:

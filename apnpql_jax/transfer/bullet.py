@@ -19,7 +19,7 @@ from apnpql_jax.errors import ConfigError
 from apnpql_jax.transfer import urdf
 
 VERSION = 1
-"""Of the worlds in Bullet: raised by a change of their bodies, contacts or servos."""
+"""Version of Bullet's worlds; it increases if bodies, contacts or servos change."""
 
 
 def require(option: str) -> None:

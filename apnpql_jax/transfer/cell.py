@@ -94,7 +94,7 @@ class Cell:
     return Worlds(env, latency_s=latency_s, admittance=self.admittance)
 
   def make_renderer(self, env: Env) -> Renderer | None:
-    """Returns what draws the images; None if the environment does itself."""
+    """Returns the renderer; None if the environment draws the images itself."""
     draws = {"opengl": OpenGL, "tiny": Tiny}
     if self.renderer not in draws:
       return None

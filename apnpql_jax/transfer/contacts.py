@@ -16,8 +16,8 @@ import numpy as np
 def sliding(model: mujoco.MjModel) -> dict[int, float]:
   """Returns a factor for each body whose products are the frictions of the pairs.
 
-  With several frictions between two bodies, their median counts. Factors fit in the
-  sense of least squares of logarithms, if not exactly.
+  Of several frictions between two bodies, the median counts. If no factors are exact,
+  they are the least-squares solution for the logarithms.
   """
   found = defaultdict(list)
   for pair, bodies in enumerate(_bodies(model)):

@@ -49,7 +49,7 @@ class Played:
   """Their configurations at every instant, f32[time, worlds, nq]."""
 
   def without_last(self, count: int) -> Played:
-    """Returns the episodes but the last ones, whose states stay."""
+    """Returns all but the last ``count`` episodes; ``start`` and ``qpos`` are kept."""
     kept = len(self.success) - count
     names = "success", "length", "stages", "rows"
     return dataclasses.replace(self, **{x: getattr(self, x)[:kept] for x in names})

@@ -1,7 +1,7 @@
 """MuJoCo's shapes as PyBullet draws them.
 
-PyBullet's own cylinders and capsules have the shades of other shapes, a flat disc those
-of a cone. So everything round is a mesh here.
+PyBullet shades its own cylinders and capsules like other shapes: a flat disc looks like
+a cone. Everything round is therefore a mesh here.
 """
 
 from __future__ import annotations

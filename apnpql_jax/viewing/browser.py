@@ -30,7 +30,7 @@ class Browser:
   """A web server that shows a session; a ``session.View``."""
 
   def __init__(self, session: Session, *, host: str, port: int):
-    """Starts to serve; takes the next free port if ``port`` is taken.
+    """Starts the server; if ``port`` is taken, uses the next free one.
 
     Raises:
       ConfigError: viser is not installed, or the address cannot be served.
@@ -56,7 +56,7 @@ class Browser:
     self._add_controls()
 
   def close(self) -> None:
-    """Stops to serve."""
+    """Stops the server."""
     self._server.stop()
 
   def show(self, frames: Sequence[Frame]) -> None:

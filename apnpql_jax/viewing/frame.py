@@ -26,7 +26,7 @@ class Hand:
   """Rotation of the tool at the end."""
 
   close: float
-  """Probability with which the gripper shall close."""
+  """Probability that the gripper is told to close."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,7 @@ from apnpql_jax.viewing.frame import Frame
 from apnpql_jax.viewing.player import Player
 
 LOOK_S = 2.0
-"""Time between looks for new checkpoints."""
+"""Time between checks for new checkpoints."""
 
 HOLD_S = 1.5
 """Time for which the last instant of an episode stays."""

@@ -1,4 +1,4 @@
-"""A figure of which each frame draws only what has changed."""
+"""A figure that redraws only what has changed since the previous frame."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ class Sheet:
     """Returns the page as u8[H, W, 3].
 
     Args:
-      key: What the axes depend on; ``prepare`` makes them where it differs from the
-        last one.
+      key: What the axes depend on. If it differs from the last key, ``prepare`` makes
+        the axes again.
       prepare: Makes the axes.
       draw: Adds what changes with every frame.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.metadata import EntryPoint
 import json
 import os
 from pathlib import Path
@@ -95,15 +96,15 @@ def test_an_exception_is_a_finding():
   assert found.text == "ZeroDivisionError: division by zero" and found.cure
 
 
-def test_missing_memory_names_the_presets():
+def test_missing_memory_names_the_presets(monkeypatch):
+  broken = EntryPoint("broken", "none:CONFIG", "apnpql.presets")
+  monkeypatch.setattr(files, "_installed", lambda: {"broken": broken})
   (found,) = machine.memory(1 << 50)
   assert not found.cure
   (found,) = machine.memory(0)
-  assert found.needed and all(name in found.cure for name in files.preset_names())
-  sizes = {
-    name: machine.checks.replay_bytes(files.load_preset(name))
-    for name in files.preset_names()
-  }
+  own = files.own_preset_names()
+  assert found.needed and all(name in found.cure for name in own)
+  sizes = {name: machine.checks.replay_bytes(files.load_preset(name)) for name in own}
   largest = max(sizes, key=lambda name: sizes[name])
   (found,) = machine.memory(sizes[largest] + PROCESS_BYTES - 1)
   assert not found.needed and largest in found.cure

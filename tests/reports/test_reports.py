@@ -52,8 +52,11 @@ def test_a_folder_of_runs_counts_as_its_runs_and_each_once(sweep):
     ("config.json", "{", "config.json"),
     ("evaluation.json", "[1]", "evaluation.json is not a JSON object"),
     ("versions.json", "{", "versions.json cannot be read"),
+    ("versions.json", '{"git": "abc"}', "versions.json is not what a run writes"),
+    ("versions.json", '{"git": {"commit": null}}', "versions.json is not"),
     ("metrics.jsonl", "x eval/success_rate\n", None),
     ("metrics.jsonl", '"eval/success_rate"\n', "metrics.jsonl, line 1"),
+    ("metrics.jsonl", '{"step": 1, "eval/success_rate": "x"}\n', "jsonl, line 1"),
   ],
 )
 def test_what_cannot_be_read_is_named_and_costs_only_itself(

@@ -15,6 +15,7 @@ from apnpql_jax.cli.main import main
 from apnpql_jax.deploy.export import VERSION
 from apnpql_jax.errors import ConfigError, DeviceError, FileError
 from apnpql_jax.robot import cell, devices, policy_folder
+from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.limits import MotionLimiter
 from apnpql_jax.testing import ROOT
 
@@ -118,6 +119,12 @@ def test_the_page_shows_the_example():
   assert f"```toml\n{cell.EXAMPLE}```" in page
 
 
+def test_the_frame_of_the_workspace_is_that_of_the_pages():
+  """World x is Base y, world y is minus Base x; test_robot.py has the DH base."""
+  x, y, z = base = np.array([0.3, -0.4, 0.2])
+  np.testing.assert_allclose(ArmModel().base_mat @ base, [y, -x, z], atol=1e-7)
+
+
 @pytest.mark.parametrize(
   ("old", "new", "message"),
   [
@@ -131,7 +138,20 @@ def test_the_page_shows_the_example():
     ("[0.25, -0.35, 0.005]", "[0.9, 0, 0]", "low_m must be below"),
     ("210987654321", "123456789012", "are the same camera"),
     ("[arm]", "[arm", "cannot be read"),
-    ("[gripper]", "[limits]\njoint_velocity_rad_per_s = 2\n[gripper]", "be 0.1 to 1"),
+    *(
+      (
+        "[gripper]",
+        f"[{table}]\n{key} = {value}\n[gripper]",
+        f"{table}.{key} = .*{text}",
+      )
+      for table, key, value, text in (
+        ("limits", "joint_velocity_rad_per_s", 2, "must be 0.1 to 1"),
+        ("admittance", "contact_stiffness_n_per_m", 10, "must be 5000 to 50000"),
+        ("admittance", "contact_stiffness_n_per_m", 1e6, "must be 5000 to 50000"),
+        ("admittance", "lag_s", 0.001, "must be 0.03 to 0.1"),
+        ("admittance", "lag_s", 45, "must be 0.03 to 0.1"),  # Milliseconds.
+      )
+    ),
   ],
 )
 def test_bad_cells_name_the_key_and_the_cure(tmp_path, old, new, message):

@@ -32,8 +32,7 @@ from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.doubles.server import ask
 from apnpql_jax.robot.drivers import realsense
 from apnpql_jax.robot.policy_folder import PolicyFolder
-from apnpql_jax.robot.protocols import ArmState, Frame, GripperState
-from apnpql_jax.robot.supervisor import CAMERAS
+from apnpql_jax.robot.protocols import CAMERAS, ArmState, Frame, GripperState
 
 OPEN_CAMERAS = devices.open_cameras
 

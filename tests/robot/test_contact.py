@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from contact import FILTER_S, stiffness_limit
 import numpy as np
 import pytest
 from rigs import NEUTRAL
 
 from apnpql_jax.robot.arm_model import ArmModel
-from apnpql_jax.robot.contact import FILTER_S, stiffness_limit
 from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.sensor import FREE_FORCE, load
 from apnpql_jax.robot.virtual_arm import Admittance, VirtualArm, ramp

@@ -28,10 +28,10 @@ from apnpql_jax.robot.blackboard import Blackboard, Phase, text
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
 from apnpql_jax.robot.devices import Robot
-from apnpql_jax.robot.protocols import Frame
+from apnpql_jax.robot.protocols import CAMERAS, Frame
 from apnpql_jax.robot.recorder import Recorder
 from apnpql_jax.robot.simulated import process as simulation
-from apnpql_jax.robot.supervisor import CAMERAS, Mode
+from apnpql_jax.robot.supervisor import Mode
 from apnpql_jax.testing import export_untrained
 
 CONTEXT = get_context("spawn")

@@ -11,7 +11,7 @@ import pytest
 
 from apnpql_jax.data import lerobot
 from apnpql_jax.errors import FileError
-from apnpql_jax.robot import policy_process, recorder, replay
+from apnpql_jax.robot import recorder, replay
 from apnpql_jax.robot.protocols import Frame
 
 pytest.importorskip("pyarrow")
@@ -75,7 +75,7 @@ def test_a_log_of_the_same_policy_gives_its_actions(tmp_path):
 def test_recorded_episodes_are_repeated_and_then_the_arm_stands_still(tmp_path):
   folder, other = tmp_path / "log", 0.5 * velocities()[:3]
   log(folder, velocities(), other)
-  act = policy_process.replaying(replay.recorded_actions(folder, CONTRACT))
+  act = replay.replaying(replay.recorded_actions(folder, CONTRACT))
   for episode, expected in enumerate((velocities(), other, velocities())):
     found = [act({}, episode, instant) for instant in range(len(expected))]
     np.testing.assert_array_equal(found, expected)

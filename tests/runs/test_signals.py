@@ -25,7 +25,7 @@ def busy(*_):
 def train(*_):
   with Signals("nothing is saved") as signals:
     if sys.argv[1] == "training":
-      signals.finish_first("stopped at once")
+      signals.finish_first("saving", "stopped at once")
     busy()
 
 command = busy if sys.argv[1] == "listing" else train
@@ -115,7 +115,7 @@ def test_a_second_signal_does_not_wait_but_one_sent_twice_is_one():
   with _busy("training") as process:
     process.send_signal(signal.SIGTERM)
     assert process.stdout is not None
-    assert process.stdout.readline().startswith("finishing this iteration")
+    assert process.stdout.readline() == "saving; once more to stop at once\n"
     process.send_signal(signal.SIGTERM)  # As `timeout` does.
     with pytest.raises(subprocess.TimeoutExpired):
       process.wait(1.5)
@@ -148,7 +148,7 @@ def test_the_exit_code_is_right_even_if_no_line_can_be_written():
 def test_signals_are_collected_and_given_back(number, capfd):
   before = signal.getsignal(number)
   with Signals("") as signals:
-    signals.finish_first("")
+    signals.finish_first("", "")
     os.kill(os.getpid(), number)
     assert signals.caught == [number]
   assert signal.getsignal(number) == before

@@ -114,7 +114,7 @@ def test_the_expert_has_a_film_without_explanations(tmp_path):
       ["expert", "--task", "push_plate", "--video", "x.avi"],
       "must end in .mp4 or .gif",
     ),
-    (["expert", "--task", "push_plate", "--port", "0"], "port=0"),
+    (["expert", "--task", "push_plate", "--port", "0"], "--port 0"),
     (["random", "--task", "push_plate", "--acting", "mean"], "need a run folder"),
     (["expert", "--task", "push_plate", "--seed", "-1"], "seed=-1"),
   ],

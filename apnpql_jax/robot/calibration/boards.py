@@ -12,6 +12,7 @@ import numpy as np
 
 from apnpql_jax.atomic import replacing
 from apnpql_jax.errors import ConfigError, check_name
+from apnpql_jax.robot.vendors import opencv
 
 DICTIONARIES = ("4x4_50", "5x5_100", "6x6_250", "7x7_250")
 """Sets of markers, by modules along a side and number of markers."""
@@ -165,25 +166,6 @@ def other_board(board: Board, image: np.ndarray) -> str | None:
       return f"{len(ids)} markers of {name} in another layout or number"
   found, _ = cv2.findChessboardCorners(gray, (board.columns - 1, board.rows - 1))
   return "a chessboard without markers" if found else None
-
-
-def opencv() -> Any:
-  """Returns OpenCV.
-
-  Raises:
-    ConfigError: It is missing, or of a version without what is needed.
-  """
-  try:
-    import cv2
-  except ImportError:
-    cv2 = None
-  # The wheels of version 5 lack this solver.
-  if not hasattr(cv2, "calibrateHandEye") or not hasattr(cv2, "aruco"):
-    raise ConfigError(
-      "calibration needs OpenCV 4: "
-      "pip install 'opencv-contrib-python-headless>=4.11,<5'"
-    )
-  return cv2
 
 
 def _dictionary(name: str) -> Any:

@@ -28,6 +28,7 @@ from apnpql_jax.robot.calibration.files import CalibratedCamera, Calibration
 from apnpql_jax.robot.calibration.problem import Problem
 from apnpql_jax.robot.calibration.solve import Solution
 from apnpql_jax.robot.calibration.views import MeasuredArm, NativeCamera, Views
+from apnpql_jax.robot.vendors import opencv
 
 Json = dict[str, Any]
 
@@ -82,7 +83,7 @@ def calibrate(
     UserError: The views do not suffice, or a camera is not where the policy was trained
       for; nothing is written then but pictures.
   """
-  boards.opencv()
+  opencv()
   kind = boards.parse(board)
   check_name("--board-on", board_on, BOARD_ON)
   check_writable(out.absolute().parent)
@@ -212,7 +213,6 @@ def _calibrate_one(
     solution = solve.solve_fixed(problem, tables[0].solution.board)
   about = {
     "lens_from": source,
-    "method": solution.method,
     "residuals": solution.residuals
     | {"outliers": [shown.names[rows[i]] for i in solution.residuals["outliers"]]},
   }

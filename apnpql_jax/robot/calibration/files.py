@@ -49,32 +49,6 @@ class Calibration:
   board: str
   cameras: Mapping[str, CalibratedCamera]
 
-  def check_camera(
-    self, name: str, *, serial: str, size: tuple[int, int] | None = None
-  ) -> None:
-    """Checks that a connected camera is the calibrated one.
-
-    Args:
-      name: Its name in the contract.
-      serial: Its serial number.
-      size: Height and width of its native images.
-
-    Raises:
-      FileError: It is another one, or has another image size.
-    """
-    camera = self.cameras[name]
-    if camera.serial != serial:
-      raise FileError(
-        f"the calibration is of the {name} camera {camera.serial}, but {serial} is "
-        "connected: connect that camera, or calibrate this one"
-      )
-    lens = camera.lens
-    if size is not None and size != (lens.height, lens.width):
-      raise FileError(
-        f"the {name} camera was calibrated with {lens.width}x{lens.height} pixels, but "
-        f"its images have {size[1]}x{size[0]}: choose that mode, or calibrate again"
-      )
-
 
 def save(path: Path, calibration: Calibration) -> None:
   """Writes a calibration.
@@ -154,8 +128,11 @@ def load(
     camera, (_, entry) = calibration.cameras[name], limits.place(contract, name)
     if camera.entry != entry:
       raise FileError(f"{path}: the {name} camera has no {entry}")
-    if serials is not None:
-      calibration.check_camera(name, serial=serials[name])
+    if serials is not None and serials[name] != camera.serial:
+      raise FileError(
+        f"the calibration is of the {name} camera {camera.serial}, but {serials[name]} "
+        "is connected: connect that camera, or calibrate this one"
+      )
     limits.check(contract, name, camera.pose, camera.lens)
   return calibration
 

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from apnpql_jax.errors import ConfigError
-from apnpql_jax.robot.calibration.boards import Board, Seen, opencv
+from apnpql_jax.robot.calibration.boards import Board, Seen
+from apnpql_jax.robot.vendors import opencv
 
 FEWEST_VIEWS = 8  # from which a lens is estimated
 

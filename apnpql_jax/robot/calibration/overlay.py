@@ -12,8 +12,8 @@ import numpy as np
 from apnpql_jax.atomic import replacing
 from apnpql_jax.config import files
 from apnpql_jax.robot import images
-from apnpql_jax.robot.calibration.boards import opencv
 from apnpql_jax.robot.calibration.lenses import Lens
+from apnpql_jax.robot.vendors import opencv
 from apnpql_jax.sim.graphics import View
 
 Json = dict[str, Any]

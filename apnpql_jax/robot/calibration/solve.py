@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from typing import Any
+import warnings
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from apnpql_jax.errors import ConfigError
-from apnpql_jax.robot.calibration.boards import opencv
 from apnpql_jax.robot.calibration.problem import (
   Problem,
   angle_deg,
@@ -39,7 +39,6 @@ class Solution:
   camera: np.ndarray  # X
   board: np.ndarray  # Y
   kept: np.ndarray  # bool[views]: not an outlier
-  method: str  # that gave the first guess
   residuals: dict[str, Any]
 
 
@@ -52,14 +51,14 @@ def solve(problem: Problem) -> Solution:
   """
   check_motion(problem)
   poses = np.stack([problem.lens.board_pose(problem.board, x) for x in problem.seen])
-  camera, board, method = _first_guess(problem, poses)
+  camera, board = _first_guess(problem, poses)
   camera, board, kept = _without_outliers(problem, camera, board)
   good = problem.select(np.flatnonzero(kept))
   check_motion(good)
   _check_scale(good, camera, board)
   residuals = _residuals(good, poses[kept], camera, board)
   residuals |= {"views": int(kept.sum()), "outliers": np.flatnonzero(~kept).tolist()}
-  return Solution(camera, board, kept, method, residuals)
+  return Solution(camera, board, kept, residuals)
 
 
 def solve_fixed(problem: Problem, board: np.ndarray) -> Solution:
@@ -78,7 +77,7 @@ def solve_fixed(problem: Problem, board: np.ndarray) -> Solution:
   good = problem.select(np.flatnonzero(kept))
   residuals = _residuals(good, poses[kept], camera, board, fixed=True)
   residuals |= {"views": int(kept.sum()), "outliers": np.flatnonzero(~kept).tolist()}
-  return Solution(camera, board, kept, "PnP", residuals)
+  return Solution(camera, board, kept, residuals)
 
 
 def check_motion(problem: Problem) -> None:
@@ -105,48 +104,43 @@ def check_motion(problem: Problem) -> None:
     )
 
 
-def _first_guess(
-  problem: Problem, poses: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, str]:
-  """Returns X, Y and the name of OpenCV's solver with the least median error.
+def hand_eye(hands: np.ndarray, poses: np.ndarray) -> np.ndarray:
+  """Returns the X that makes H_i X P_i the same in all views i.
 
-  Each solver gets all views, and random choices, of which some have no outliers.
+  For two views, that is A X = X B with A = H_j^-1 H_i and B = P_j P_i^-1, solved in
+  closed form for all pairs: F. C. Park and B. J. Martin, "Robot sensor calibration:
+  solving AX = XB on the Euclidean group", 1994.
+
+  Args:
+    hands: H, f64[views, 4, 4].
+    poses: P, f64[views, 4, 4].
   """
-  cv2 = opencv()
-  solvers = {
-    name: getattr(cv2, f"CALIB_HAND_EYE_{name}")
-    for name in ("TSAI", "PARK", "HORAUD", "ANDREFF", "DANIILIDIS")
-  }
+  i, j = np.triu_indices(len(hands), 1)
+  a, b = np.linalg.inv(hands[j]) @ hands[i], poses[j] @ np.linalg.inv(poses[i])
+  turns = (Rotation.from_matrix(x[:, :3, :3]).as_rotvec() for x in (a, b))
+  camera = np.eye(4)
+  with warnings.catch_warnings(action="ignore"):  # Of views about a single axis.
+    camera[:3, :3] = Rotation.align_vectors(*turns)[0].as_matrix()
+  rows = np.eye(3) - a[:, :3, :3]
+  shifts = a[:, :3, 3] - b[:, :3, 3] @ camera[:3, :3].T
+  camera[:3, 3] = np.linalg.lstsq(rows.reshape(-1, 3), shifts.reshape(-1))[0]
+  return camera
+
+
+def _first_guess(problem: Problem, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the X and Y with the least median error.
+
+  They are solved from all views, and from random choices, of which some have no
+  outliers.
+  """
   rng, count = np.random.default_rng(0), len(poses)
   subsets = [np.arange(count)]
   subsets += [rng.permutation(count)[:_SUBSET] for _ in range(_SUBSETS)]
-  hands = np.linalg.inv(problem.motion)
-  best: tuple[float, Any, Any, str] = (np.inf, None, None, "")
-  for index, rows in enumerate(subsets):
-    for name, method in solvers.items():
-      if index and name != "PARK":
-        continue
-      try:
-        turn, shift = cv2.calibrateHandEye(
-          hands[rows, :3, :3],
-          hands[rows, :3, 3],
-          poses[rows, :3, :3],
-          poses[rows, :3, 3],
-          method=method,
-        )
-      except cv2.error:
-        continue  # Another solver may take these views.
-      camera = np.eye(4)
-      camera[:3, :3], camera[:3, 3] = turn, shift.ravel()
-      if not np.isfinite(camera).all() or np.linalg.det(turn) < 0.5:
-        continue
-      board = _mean_pose(hands[rows] @ camera @ poses[rows])
-      error = float(np.median(problem.error_of_views(camera, board)))
-      if error < best[0]:
-        best = error, camera, board, name
-  if best[1] is None:
-    raise ConfigError("no solver finds a pose: take new views")
-  return best[1:]
+  hands, guesses = np.linalg.inv(problem.motion), []
+  for rows in subsets:
+    camera = hand_eye(hands[rows], poses[rows])
+    guesses.append((camera, _mean_pose(hands[rows] @ camera @ poses[rows])))
+  return min(guesses, key=lambda x: np.median(problem.error_of_views(*x)))
 
 
 def _without_outliers(

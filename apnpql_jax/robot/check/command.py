@@ -8,13 +8,9 @@ from __future__ import annotations
 import contextlib
 from typing import Any
 
-import numpy as np
-
-from apnpql_jax.robot import policy_process, setup
-from apnpql_jax.robot.arm_model import ArmModel
+from apnpql_jax.robot import policy_process, priority, setup
 from apnpql_jax.robot.check import devices, program
 from apnpql_jax.robot.check.table import Table
-from apnpql_jax.robot.contact import FILTER_S, stiffness_limit
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.simulated.devices import started
@@ -35,6 +31,8 @@ def check(
     "cell": str(robot.cell.path or f"that of the {robot.kind} robot"),
     "calibration": str(robot.cell.calibration or "none needed"),
   }
+  if robot.kind == "ur5e":
+    table.rows["priority"] = _priority()
   with table.row("calibration"):
     setup.check_calibration(robot)
   act = program.rest
@@ -52,20 +50,20 @@ def check(
       if loaded:
         program.report(table, robot, seconds)
       devices.ages(table, robot, ages)
-  table.rows["admittance"] = _contacts(policy, robot) if admittance else "off"
+  table.rows["admittance"] = _contacts(robot) if admittance else "off"
   return table.result()
 
 
-def _contacts(policy: PolicyFolder, robot: Robot) -> str:
-  """Returns which contacts stay stable, at the neutral pose."""
+def _priority() -> str:
+  if priority.is_granted():
+    return "real-time, of the control process"
+  return "not real-time: set a limit rtprio, see docs/robot_first_run.md"
+
+
+def _contacts(robot: Robot) -> str:
+  """Returns which contacts stay stable: those of less than D_c / tau."""
   admittance = robot.cell.admittance()
-  dynamics = ArmModel().dynamics(policy.neutral, np.zeros(6))
-  bears = min(
-    stiffness_limit(
-      dynamics, axis, admittance, admittance.lag - FILTER_S, saturated=True
-    )
-    for axis in np.eye(3)
-  )
+  bears = admittance.damping / admittance.lag
   return (
     f"damping of {admittance.damping:.0f} N s/m in contact; stable for walls of up to "
     f"{1e-3 * bears:.0f} kN/m at a lag of {1e3 * admittance.lag:.0f} ms"

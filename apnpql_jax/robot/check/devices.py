@@ -20,8 +20,7 @@ from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.check.table import Table
 from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.limits import Limits, MotionLimiter
-from apnpql_jax.robot.protocols import ArmState, Frame
-from apnpql_jax.robot.supervisor import CAMERAS
+from apnpql_jax.robot.protocols import CAMERAS, ArmState, Frame
 
 _WAIT_S = 5.0
 """Time that a camera may take for its first frame."""

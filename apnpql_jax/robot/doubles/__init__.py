@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 import contextlib
+import dataclasses
 import itertools
 import os
 from typing import Any
@@ -28,51 +29,20 @@ PAYLOAD_COG_M = (-0.006, 0.0, 0.048)
 _COUNT = itertools.count()
 
 
+@dataclasses.dataclass
 class Doubles:
-  """The devices, connected through their drivers, and their faults."""
+  """The devices, connected through their drivers."""
 
-  def __init__(
-    self, host: str, arm: UR5e, gripper: RHP12RN, cameras: dict[str, RealSense]
-  ):
-    """Keeps the devices and the address of the processes behind them."""
-    self.host = host
-    self.arm, self.gripper, self.cameras = arm, gripper, cameras
+  host: str
+  """Address of the processes behind them."""
 
-  def drop_rtde(self) -> None:
-    """Cuts the connection to the arm for good."""
-    ask(self.host, "drop_rtde")
+  arm: UR5e
+  gripper: RHP12RN
+  cameras: dict[str, RealSense]
 
-  def protective_stop(self) -> None:
-    """Stops the arm as after a collision."""
-    ask(self.host, "protective_stop")
-
-  def emergency_stop(self) -> None:
-    """Stops the arm as if the button was pushed."""
-    ask(self.host, "emergency_stop")
-
-  def stop_program(self) -> None:
-    """Ends the program on the controller, as the teach pendant can."""
-    ask(self.host, "stop_program")
-
-  def drift_force(self) -> None:
-    """Moves the zero of the force-torque sensor."""
-    ask(self.host, "drift_force")
-
-  def silence_gripper(self) -> None:
-    """Makes the gripper ignore its bus, as without power."""
-    ask(self.host, "silence_gripper")
-
-  def fail_gripper(self) -> None:
-    """Makes the gripper report an overload."""
-    ask(self.host, "fail_gripper")
-
-  def unplug_cameras(self) -> None:
-    """Ends the frames of both cameras."""
-    ask(self.host, "unplug_cameras")
-
-  def state(self) -> dict[str, Any]:
-    """Returns the plant's true state: position, target, finger, qpos, mocap poses."""
-    return ask(self.host, "state")
+  def ask(self, name: str) -> Any:
+    """Causes a fault, or returns the true "state": a method of ``server.Remote``."""
+    return ask(self.host, name)
 
 
 @contextlib.contextmanager

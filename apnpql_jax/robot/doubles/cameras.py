@@ -18,8 +18,8 @@ import numpy as np
 from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot.doubles.child import Child
 from apnpql_jax.robot.doubles.server import ask
-from apnpql_jax.robot.drivers import vendor
 from apnpql_jax.robot.drivers.realsense import RATE, RealSense
+from apnpql_jax.robot.vendors import vendor
 
 SIZE = 240, 424  # a mode of both cameras
 MODELS = {"global": ("D455", 90.0), "wrist": ("D435", 69.8)}

@@ -8,6 +8,7 @@ the same commands (``rtde_control.script`` of ur_rtde 1.6) when any program was 
 from __future__ import annotations
 
 from collections.abc import Mapping
+import math
 import time
 from typing import Any
 
@@ -22,7 +23,8 @@ SERIAL = "20265500000"
 
 _READY, _DONE = 1, 2
 _NO_COMMAND, _ZERO_WRENCH, _SERVO, _SERVO_STOP, _PAYLOAD = 0, 8, 11, 16, 17
-_PROTECTIVE_STOP, _STOP_JOINTS, _STOP_PROGRAM = 31, 34, 255
+_PROTECTIVE_STOP, _STOP_JOINTS, _WATCHDOG, _STOP_PROGRAM = 31, 34, 35, 255
+_COMMAND = "input_int_register_0"
 _RUNNING, _STOPPED = 2, 1  # runtime_state
 _STANDARD = {
   "robot_mode": 7,
@@ -65,16 +67,20 @@ class Controller:
     self._boot = time.monotonic()
     self._inputs: dict[str, float] = {}
     self._executing, self._answer = False, 0
+    self._silence, self._patience = 0.0, math.inf  # s since the last command
 
   def upload(self, script: bytes) -> None:
     """Starts a program, which ends in ``end``, if the arm may move."""
     self.programs += 1
     if script.rstrip().endswith(b"end") and self.remote and self.safety == "NORMAL":
       self.running, self._executing, self._answer = True, False, _READY
+      self._silence, self._patience = 0.0, math.inf
 
   def write(self, registers: Mapping[str, float]) -> None:
     """Takes input registers; the program reads them in its next cycle."""
     self._inputs.update(registers)
+    if _COMMAND in registers:
+      self._silence = 0.0
 
   def stop_program(self) -> None:
     """Ends the program; the arm brakes."""
@@ -90,7 +96,10 @@ class Controller:
     self._safety_stop("ROBOT_EMERGENCY_STOP")
 
   def cycle(self) -> None:
-    """Runs one control cycle."""
+    """Runs one control cycle; the watchdog ends a program without commands."""
+    self._silence += TIMESTEP
+    if self.running and self._silence > self._patience:
+      self.stop_program()
     if self.running:
       self._program()
     if self.plant.step() and self.safety == "NORMAL":
@@ -147,7 +156,7 @@ class Controller:
 
   def _program(self) -> None:
     """Obeys one command, as a cycle of the program does."""
-    command = int(self._inputs.get("input_int_register_0", _NO_COMMAND))
+    command = int(self._inputs.get(_COMMAND, _NO_COMMAND))
     if command == _NO_COMMAND:
       self._executing, self._answer = False, _READY
     elif command == _SERVO:
@@ -171,8 +180,13 @@ class Controller:
     elif command == _PAYLOAD:
       mass, *center = self._doubles(4)
       self.plant.set_payload(mass, np.array(center))
+    elif command == _WATCHDOG:
+      self._patience = 1 / self._doubles(1)[0]
     elif command == _PROTECTIVE_STOP:
       self.protective_stop()
+    else:  # Not without notice: the double lacks what it would do.
+      self.stop_program()
+      return True
     self._answer = _DONE
     return True
 

@@ -16,23 +16,21 @@ import mujoco
 import numpy as np
 
 from apnpql_jax.config import files
-from apnpql_jax.robot.arm_model import BASE, FLANGE, JOINTS
+from apnpql_jax.robot.arm_model import FLANGE
 from apnpql_jax.robot.limits import TIMESTEP
-from apnpql_jax.robot.simulated.plant import subtree
+from apnpql_jax.robot.sensor import Sensor
+from apnpql_jax.robot.simulated.plant import Plant, Servo
 
-FINGER = "finger_r1"
 SPEED_LIMIT = math.pi  # rad/s, the UR5e's joints, data sheet
-STIFFNESS, DAMPING = 1e4, 200.0  # 1/s^2, 1/s: critically damped at 16 Hz
 DEVIATION_LIMIT = 0.15  # rad between target and joint, beyond which the arm stops
 FORCE_LIMIT = 150.0  # N on the tool: the default of the safety settings
 BIAS = np.array([2.0, -1.5, 3.0, 0.1, -0.2, 0.05])  # N, N m: of the sensor when on
 DRIFT = np.array([6.0, 0.0, -10.0, 0.0, 0.3, 0.0])  # N, N m: of ``World.drift``
-NOISE = np.array([0.3, 0.3, 0.3, 0.01, 0.01, 0.01])  # N, N m: standard deviations
 REFERENCE_GAIN = 300.0
 
 
 class World:
-  """One world of a task's scene."""
+  """One world of a task's scene: a ``Plant`` without friction, as servoJ drives it."""
 
   def __init__(self, scene: str, *, noise: bool = True):
     """Compiles the scene and starts in its keyframe "neutral".
@@ -40,40 +38,27 @@ class World:
     Raises:
       ConfigError: There is no such scene.
     """
-    self.model = model = compile_scene(scene)
-    model.opt.timestep = TIMESTEP
-    self.data = data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, model.key("neutral").id)
-    joints = [model.joint(name) for name in JOINTS]
-    self._qpos = np.array([joint.qposadr[0] for joint in joints])
-    self._dofs = np.array([joint.dofadr[0] for joint in joints])
-    self._torques = model.actuator_ctrlrange[:6, 1].copy()
-    finger = model.joint(FINGER)
-    self._finger, self._finger_dof = int(finger.qposadr[0]), int(finger.dofadr[0])
-    self._gripper = model.body("gripper").id
-    self._tool = subtree(model, self._gripper)
-    self._weight = model.body_subtreemass[self._gripper] * model.opt.gravity
-    self._flange, self._base = data.site(FLANGE), data.site(BASE)
-    self._mass = np.zeros((model.nv, model.nv))
-    self._block = np.ix_(self._dofs, self._dofs)
+    self._plant = Plant(compile_scene(scene), Servo(friction_nm=(0.0,) * 6))
+    self.model, self.data = self._plant.model, self._plant.data
+    rng = np.random.default_rng(0)
+    self._plant.sensor = Sensor(rng, error=0.0, noise=float(noise))
+    self._plant.sensor.drift(BIAS)
+    self._tool = self.model.body("gripper").id
+    self._payload = 0.0, np.zeros(3)
     self._goal, self._lag = self.position, TIMESTEP
     self.lock()
-    self._finger_goal, self._finger_speed, self._grip = self.finger, 0.0, 0.0
-    self._rng = np.random.default_rng(0) if noise else None
-    self._bias, self._zero = BIAS, np.zeros(6)
-    self._payload = 0.0, np.zeros(3)
-    mujoco.mj_forward(model, data)
-    self.wrench = self._measure()
+    self.grip(self.finger, 0.0, 0.0)
+    self.wrench = self._plant.sensor.read(self._measure())
 
   @property
   def position(self) -> np.ndarray:
     """Joint angles, rad."""
-    return self.data.qpos[self._qpos]
+    return self._plant.position
 
   @property
   def velocity(self) -> np.ndarray:
     """Joint velocities, rad/s."""
-    return self.data.qvel[self._dofs]
+    return self._plant.velocity
 
   @property
   def target_velocity(self) -> np.ndarray:
@@ -83,12 +68,7 @@ class World:
   @property
   def finger(self) -> float:
     """Angle of the driven finger, rad."""
-    return float(self.data.qpos[self._finger])
-
-  @property
-  def finger_velocity(self) -> float:
-    """Velocity of the driven finger, rad/s."""
-    return float(self.data.qvel[self._finger_dof])
+    return self._plant.gripper_angle
 
   def servo(self, goal: np.ndarray, lookahead: float, gain: float) -> None:
     """Takes a target of servoJ, rad; ``lookahead`` in s."""
@@ -119,21 +99,17 @@ class World:
 
   def zero_wrench(self) -> None:
     """Makes the present wrench the origin of its measurement."""
-    self._zero = self._measure() + self._zero
+    self._plant.sensor.zero(self._measure())
 
   def drift(self) -> None:
     """Moves the zero of the wrench by ``DRIFT``, as warming up does, but at once."""
-    self._bias = self._bias + DRIFT
+    self._plant.sensor.drift(DRIFT)
 
   def step(self) -> str:
     """Advances by 2 ms; returns why the controller would stop the arm, or ""."""
     self._smooth()
-    model, data = self.model, self.data
-    mujoco.mj_step1(model, data)
-    data.ctrl[:6] = self._arm_torque()
-    data.ctrl[6] = self._finger_torque()
-    mujoco.mj_step2(model, data)
-    self.wrench = self._measure()
+    self._plant.drive(self.target, self._velocity, self._finger_torque())
+    self.wrench = self._plant.sensor.read(self._measure())
     if np.abs(self.target - self.position).max() > DEVIATION_LIMIT:
       return "the joints deviate from their target"
     if np.linalg.norm(self.wrench[:3]) > FORCE_LIMIT:
@@ -152,45 +128,19 @@ class World:
       self._velocity = wanted.clip(-SPEED_LIMIT, SPEED_LIMIT)
     self.target = self.target + self._velocity * TIMESTEP
 
-  def _arm_torque(self) -> np.ndarray:
-    """Computes the torque of a stiff servo with the arm's own dynamics, N m."""
-    mujoco.mj_fullM(self.model, self.data, self._mass)
-    mass = self._mass[self._block]
-    errors = self.target - self.position, self._velocity - self.velocity
-    torque = mass @ (STIFFNESS * errors[0] + DAMPING * errors[1])
-    torque += self.data.qfrc_bias[self._dofs]
-    return torque.clip(-self._torques, self._torques)
-
   def _finger_torque(self) -> float:
     wanted = _clipped(50.0 * (self._finger_goal - self.finger), self._finger_speed)
-    return _clipped(25.0 * (wanted - self.finger_velocity), self._grip)
+    return _clipped(25.0 * (wanted - self._plant.gripper_velocity), self._grip)
 
   def _measure(self) -> np.ndarray:
-    """Returns the reading of the force-torque sensor, N and N m in base axes."""
-    wrench = self._contact()
-    arm = self.data.subtree_com[self._gripper] - self._flange.xpos
-    wrench += _moment(self._weight, arm)
-    mass, at = self._payload
-    frame = self._flange.xmat.reshape(3, 3)
-    wrench -= _moment(mass * self.model.opt.gravity, frame @ at)
-    base = self._base.xmat.reshape(3, 3)
-    turned = np.concatenate([wrench[:3] @ base, wrench[3:] @ base])
-    turned += self._bias - self._zero
-    return turned + NOISE * self._rng.normal(size=6) if self._rng else turned
-
-  def _contact(self) -> np.ndarray:
-    """Returns force and torque on the tool about the flange, in world axes."""
-    total, force = np.zeros(6), np.zeros(6)
-    contacts = self.data.contact
-    on_tool = self._tool[self.model.geom_bodyid[contacts.geom]]
-    for index in np.flatnonzero(on_tool[:, 0] != on_tool[:, 1]):
-      mujoco.mj_contactForce(self.model, self.data, index, force)
-      axes = contacts.frame[index].reshape(3, 3)
-      sign = 1.0 if on_tool[index, 1] else -1.0  # The force acts on the second geom.
-      there = sign * force[:3] @ axes
-      total += _moment(there, contacts.pos[index] - self._flange.xpos)
-      total[3:] += sign * force[3:] @ axes
-    return total
+    """Returns the wrench of contacts and weight, without the payload's, f64[6]."""
+    data, (payload, at) = self.data, self._payload
+    mass, gravity = self.model.body_subtreemass[self._tool], self.model.opt.gravity
+    flange = data.site(FLANGE)
+    lever = mass * (data.subtree_com[self._tool] - flange.xpos)
+    lever -= payload * (flange.xmat.reshape(3, 3) @ at)
+    weight = (mass - payload) * gravity, np.cross(lever, gravity)
+    return self._plant.wrench() + self._plant.in_base(*weight)
 
 
 def compile_scene(scene: str) -> mujoco.MjModel:
@@ -202,8 +152,3 @@ def compile_scene(scene: str) -> mujoco.MjModel:
 
 def _clipped(value: float, limit: float) -> float:
   return max(-limit, min(value, limit))
-
-
-def _moment(force: np.ndarray, arm: np.ndarray) -> np.ndarray:
-  (x, y, z), (a, b, c) = arm, force
-  return np.array([a, b, c, y * c - z * b, z * a - x * c, x * b - y * a])

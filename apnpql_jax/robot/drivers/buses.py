@@ -26,10 +26,11 @@ import time
 from typing import Any, Protocol
 
 from apnpql_jax.errors import DeviceError, one_line
-from apnpql_jax.robot.drivers import vendor
+from apnpql_jax.robot.vendors import vendor
 
 ATTEMPTS = 3  # without an answer, after which the gripper counts as lost
 _ANSWER_S = 0.037  # for one answer by Modbus; the SDK waits as long for four bytes
+_READ_S = 0.002  # for some bytes of an answer by the SDK
 _SILENT = "it does not answer: check its power and cable"
 
 
@@ -72,6 +73,8 @@ class Dynamixel:
     self._port, self._packets = sdk.PortHandler(port), sdk.PacketHandler(2.0)
     try:
       self._port.setBaudRate(baud)  # Opens the port.
+      # The SDK's own value of zero would keep a core busy until an answer is there.
+      self._port.ser.timeout = _READ_S
     except Exception as error:  # Those of pyserial, and of termios.
       raise DeviceError(f"could not open port {port}: {_cause(error)}") from None
 

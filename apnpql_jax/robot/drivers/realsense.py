@@ -15,8 +15,8 @@ import numpy as np
 
 from apnpql_jax.errors import DeviceError, one_line
 from apnpql_jax.robot import images
-from apnpql_jax.robot.drivers import vendor
 from apnpql_jax.robot.protocols import Frame
+from apnpql_jax.robot.vendors import vendor
 
 Json = dict[str, Any]
 

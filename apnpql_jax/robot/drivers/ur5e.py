@@ -1,11 +1,17 @@
 """The UR5e arm, by the package ``ur_rtde`` (an e-Series controller, PolyScope 5.6+).
 
 Joint targets go by servoJ, one per control cycle of 2 ms. The program of ``ur_rtde`` on
-the controller keeps the last target if none follows. The wrench is
-``actual_TCP_force`` of RTDE, which an e-Series controller gives at the tool flange, in
-the axes of the base, without the payload. Its sign, of which no document was found, is
-taken as that of the surroundings' push on the tool. The ports are those of every
-controller (dashboard 29999, script 30003, RTDE 30004); ``ur_rtde`` cannot change them.
+the controller keeps the last target if none follows. So ``start`` sets a watchdog on
+the controller: without a command for 0.5 s, it ends the program, and the arm comes to
+rest. Between motions, ``get_observation`` feeds the watchdog, so that the program goes
+on. If nobody reads the arm, it ends, and ``start`` sends it again.
+
+The wrench is ``actual_TCP_force`` of RTDE, which an e-Series controller gives at the
+tool flange, in the axes of the base, without the payload. Its sign, of which no
+document was found, is taken as that of the surroundings' push on the tool.
+
+The ports are those of every controller (dashboard 29999, script 30003, RTDE 30004);
+``ur_rtde`` cannot change them.
 """
 
 from __future__ import annotations
@@ -20,17 +26,19 @@ from typing import Any, TypeVar
 import numpy as np
 
 from apnpql_jax.errors import DeviceError, one_line
-from apnpql_jax.robot.drivers import vendor
 from apnpql_jax.robot.drivers.ur_check import check_controller
 from apnpql_jax.robot.drivers.ur_state import VARIABLES, Reports
 from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.protocols import ArmState
+from apnpql_jax.robot.vendors import vendor
 
 LOOKAHEAD = 0.03  # s, the least that servoJ takes
 GAIN = 300.0  # of servoJ, in 100..2000
 BRAKING = 4.0  # m/s^2 of the tool
+WATCHDOG = 2.0  # Hz of commands at least; servoStop brakes for 0.25 s without any
 
 _PATIENCE = 5.0  # s for the controller to carry out a command
+_FEED = 0.1  # s between two commands that feed the watchdog at rest
 
 _T = TypeVar("_T")
 
@@ -64,6 +72,7 @@ class UR5e:
     self._control: Any = None
     self._about: dict[str, Any] = {}
     self._following = False
+    self._fed = 0.0
 
   def connect(self) -> None:
     """See ``protocols.Device``; harmless if it is connected.
@@ -119,8 +128,15 @@ class UR5e:
     }
 
   def get_observation(self) -> ArmState:
-    """See ``protocols.Arm``; a lost connection is a fault, too."""
-    return self._open().measure(following=self._following)
+    """See ``protocols.Arm``; a lost connection is a fault, too.
+
+    At rest it feeds the watchdog, as targets do in motion.
+    """
+    reports = self._open()
+    state = reports.measure(following=self._following)
+    if not self._following and not state.fault and reports.program_runs:
+      self._feed()
+    return state
 
   def send_action(self, position: np.ndarray) -> None:
     """See ``protocols.Arm``.
@@ -156,7 +172,7 @@ class UR5e:
       self._open().wait_for_rest()
 
   def start(self, *, zero: bool = True) -> None:
-    """See ``protocols.Arm``; sets the payload first.
+    """See ``protocols.Arm``; sets the payload first, and the watchdog.
 
     Raises:
       DeviceError: The arm moves, or the controller does not carry out a command.
@@ -172,6 +188,7 @@ class UR5e:
     if zero:
       self._command("zero of the force sensor", control.zeroFtSensor)
     reports.wait_for_news()  # Older measurements have the old zero.
+    self._command("the watchdog", control.setWatchdog, WATCHDOG)
     self._following = True
 
   def _open(self) -> Reports:
@@ -181,6 +198,14 @@ class UR5e:
 
   def _fault(self) -> str:
     return self._open().fault(following=self._following)
+
+  def _feed(self) -> None:
+    """Feeds the watchdog, as each command does; this one is to do nothing."""
+    now = time.monotonic()
+    if now - self._fed > _FEED:
+      self._fed = now
+      with contextlib.suppress(Exception):  # What fails is a fault soon.
+        self._control.kickWatchdog()
 
   def _restart(self) -> None:
     """Clears the last command, which the program would obey, and sends it again."""

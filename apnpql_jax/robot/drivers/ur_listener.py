@@ -6,11 +6,11 @@ import contextlib
 from typing import Any
 
 from apnpql_jax.errors import DeviceError, one_line
-from apnpql_jax.robot.drivers import vendor
 from apnpql_jax.robot.drivers.ur_check import LOCAL, check_rtde, identify
 from apnpql_jax.robot.drivers.ur_state import VARIABLES, Reports
 from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.protocols import ArmState
+from apnpql_jax.robot.vendors import vendor
 
 
 class Listener:

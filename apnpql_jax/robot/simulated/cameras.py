@@ -17,9 +17,8 @@ from apnpql_jax.config import files
 from apnpql_jax.data.lerobot import conversion
 from apnpql_jax.envs.cameras import make_cameras
 from apnpql_jax.robot.blackboard import Blackboard
-from apnpql_jax.robot.protocols import Frame
+from apnpql_jax.robot.protocols import CAMERAS, Frame
 from apnpql_jax.robot.simulated.process import RECORDS
-from apnpql_jax.robot.supervisor import CAMERAS
 from apnpql_jax.sim import physics
 from apnpql_jax.sim.kinematics import make_kinematics
 from apnpql_jax.sim.physics import PhysicsState

@@ -54,11 +54,13 @@ class Plant:
     finger = model.joint("finger_r1")
     self._finger, self._finger_dof = int(finger.qposadr[0]), int(finger.dofadr[0])
     self._limit = model.actuator_ctrlrange[: len(JOINTS), 1].copy()
+    self._mass = np.zeros((model.nv, model.nv))
+    self._block = np.ix_(self._dof, self._dof)
     self._gripper = model.body("gripper").id
     self._hand = subtree(model, self._gripper)
     self.sensor = Sensor(np.random.default_rng(seed))
     """The force-torque sensor."""
-    self.data.qpos[:] = model.keyframe("neutral").qpos
+    mujoco.mj_resetDataKeyframe(model, self.data, model.key("neutral").id)
     self._settle()
 
   def zero_force(self) -> None:
@@ -88,51 +90,73 @@ class Plant:
       target: Joint angles to follow f64[6]; without, the arm keeps its place.
       close: Whether the gripper closes or opens; without, the fingers keep theirs.
     """
-    model, data, servo = self.model, self.data, self.servo
+    data, before = self.data, self._reference
     self._queue.append(self._queue[-1] if target is None else np.array(target))
-    arriving = self._queue[0]
-    before = self._reference
-    share = 1 - np.exp(-TIMESTEP / servo.lookahead_s)
-    self._reference = before + share * (arriving - before)
-    speed = (self._reference - before) / TIMESTEP
-    mass = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, mass)
-    velocity = data.qvel[self._dof]
-    wanted = servo.gain**2 * (self._reference - data.qpos[self._qpos])
-    wanted += 2 * servo.gain * (speed - velocity)
-    torque = mass[np.ix_(self._dof, self._dof)] @ wanted + data.qfrc_bias[self._dof]
-    data.ctrl[: len(JOINTS)] = torque.clip(-self._limit, self._limit)
-    data.ctrl[len(JOINTS)] = motors.gripper_torque(
+    share = 1 - np.exp(-TIMESTEP / self.servo.lookahead_s)
+    self._reference = before + share * (self._queue[0] - before)
+    finger = motors.gripper_torque(
       data.qpos[self._finger],
       data.qvel[self._finger_dof],
       float(bool(close)),
       np,
       speed=0.0 if close is None else motors.GRIPPER_SPEED,
     )
-    mujoco.mj_step1(model, data)
-    mujoco.mj_step2(model, data)
+    self.drive(self._reference, (self._reference - before) / TIMESTEP, finger)
+
+  def drive(self, target: np.ndarray, velocity: np.ndarray, finger: float) -> None:
+    """Advances by 2 ms, with the stiff feedback alone.
+
+    Args:
+      target: Joint angles f64[6] of this instant.
+      velocity: Joint velocities f64[6] of this instant, rad/s.
+      finger: Torque of the driven finger, N m.
+    """
+    model, data, gain = self.model, self.data, self.servo.gain
+    mujoco.mj_fullM(model, data, self._mass)
+    wanted = gain**2 * (target - self.position) + 2 * gain * (velocity - self.velocity)
+    torque = self._mass[self._block] @ wanted + data.qfrc_bias[self._dof]
+    data.ctrl[: len(JOINTS)] = torque.clip(-self._limit, self._limit)
+    data.ctrl[len(JOINTS)] = finger
+    mujoco.mj_step(model, data)
 
   def arm_state(self, now: float) -> ArmState:
     """Returns what the arm measures."""
-    data = self.data
-    position, velocity = data.qpos[self._qpos].copy(), data.qvel[self._dof].copy()
-    return ArmState(now, position, velocity, self.sensor.read(self.wrench()))
+    reading = self.sensor.read(self.wrench())
+    return ArmState(now, self.position, self.velocity, reading)
 
   def wrench(self) -> np.ndarray:
     """Returns force and torque of the contacts on the hand, see ``ArmState.wrench``."""
     model, data = self.model, self.data
     mujoco.mj_rnePostConstraint(model, data)
-    torque, force = np.split(data.cfrc_ext[self._hand].sum(0), 2)
-    flange, base = data.site(FLANGE), data.site(BASE)
+    torque, force = data.cfrc_ext[self._hand].sum(0).reshape(2, 3)
     center = data.subtree_com[model.body_rootid[self._gripper]]
-    torque = torque + np.cross(center - flange.xpos, force)
-    turn = base.xmat.reshape(3, 3).T
+    lever = center - data.site(FLANGE).xpos
+    return self.in_base(force, torque + np.cross(lever, force))
+
+  def in_base(self, force: np.ndarray, torque: np.ndarray) -> np.ndarray:
+    """Turns force and torque from world axes, f64[3] each, into those of the base."""
+    turn = self.data.site(BASE).xmat.reshape(3, 3).T
     return np.concatenate([turn @ force, turn @ torque])
+
+  @property
+  def position(self) -> np.ndarray:
+    """Joint angles f64[6], rad."""
+    return self.data.qpos[self._qpos]
+
+  @property
+  def velocity(self) -> np.ndarray:
+    """Joint velocities f64[6], rad/s."""
+    return self.data.qvel[self._dof]
 
   @property
   def gripper_angle(self) -> float:
     """Angle of the driven finger, rad."""
     return float(self.data.qpos[self._finger])
+
+  @property
+  def gripper_velocity(self) -> float:
+    """Velocity of the driven finger, rad/s."""
+    return float(self.data.qvel[self._finger_dof])
 
   def _settle(self) -> None:
     """Forgets commands and lets the arm hold where it is."""

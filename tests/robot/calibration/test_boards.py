@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("cv2")
 
-from apnpql_jax.errors import ConfigError
+from apnpql_jax.errors import ConfigError, DeviceError
 from apnpql_jax.robot.calibration import boards
 from apnpql_jax.robot.calibration.boards import Board
 
@@ -78,5 +78,5 @@ def test_prints_that_cannot_be_are_refused(tmp_path):
 
 def test_a_missing_package_is_one_line(monkeypatch):
   monkeypatch.setitem(sys.modules, "cv2", None)
-  with pytest.raises(ConfigError, match="opencv-contrib-python-headless>=4.11,<5"):
-    boards.opencv()
+  with pytest.raises(DeviceError, match="robot needs opencv-contrib-python-headless"):
+    boards.detect(Board(), np.zeros((9, 9, 3), np.uint8))

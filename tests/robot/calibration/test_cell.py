@@ -10,9 +10,11 @@ import pytest
 
 pytest.importorskip("rtde_receive", reason="needs ur_rtde")
 
+from apnpql_jax.cli import robot as cli
 from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot import doubles
-from apnpql_jax.robot.calibration import live
+from apnpql_jax.robot.cell import Cell
+from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.doubles.server import ask
 from apnpql_jax.robot.drivers.ur_listener import Listener
 
@@ -45,11 +47,11 @@ def test_a_missing_device_is_one_line(host, tmp_path):
   serials = {"global": "1", "wrist": "2"}
 
   def calibrate(address: str) -> None:
-    live.calibrate_cell(
-      contract, views, out, host=address, serials=serials, recorded=False
-    )
+    cell = Cell(arm_host=address, cameras=serials, calibration=out)
+    cli._calibrate(args, Robot("ur5e", contract, cell))
 
   views, out = tmp_path / "views", tmp_path / "calibration.json"
+  args = cli.Robot(action="calibrate", robot="ur5e", views=views)
   with pytest.raises(DeviceError, match="camera 2: not found .no camera is connected"):
     calibrate(host)
   with pytest.raises(DeviceError, match="127.0.0.1: port 30004"):

@@ -403,6 +403,28 @@ def test_a_late_answer_is_not_taken_for_that_to_the_next_request(modbus):
   assert not delays
 
 
+def test_the_driver_does_not_spin_while_it_waits(monkeypatch):
+  double = Gripper(TABLES[35074], World("push_plate", noise=False))
+  calls, read = [], sdk.PortHandler.readPort
+
+  def count(port, length):
+    calls.append(length)
+    return read(port, length)
+
+  def answer(data: bytes) -> bytes:
+    time.sleep(ANSWER_S)
+    return double.receive(data)
+
+  monkeypatch.setattr(sdk.PortHandler, "readPort", count)
+  with terminal(answer) as (port, _):
+    line = buses.Dynamixel(port, driver.BAUD, 1)
+    begin = time.monotonic()
+    line.read(TABLES[35074].present_position.address, 4)
+    assert time.monotonic() - begin >= ANSWER_S
+    line.close()
+  assert 2 <= len(calls) < 30
+
+
 def test_a_refusal_or_an_answer_without_data_is_no_measurement():
   access, nothing = 7, 0
   double = Gripper(TABLES[35074], World("push_plate", noise=False))

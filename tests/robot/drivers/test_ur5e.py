@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator
 import contextlib
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from apnpql_jax.robot import doubles
 from apnpql_jax.robot.doubles.controller import SERIAL, VERSION
 from apnpql_jax.robot.doubles.plant import DRIFT
 from apnpql_jax.robot.doubles.server import ask
-from apnpql_jax.robot.drivers.ur5e import UR5e
+from apnpql_jax.robot.drivers.ur5e import WATCHDOG, UR5e
 from apnpql_jax.robot.limits import TIMESTEP
 
 pytest.importorskip("rtde_control", reason="needs ur_rtde")
@@ -56,7 +57,7 @@ def wait_for_fault(arm: UR5e) -> str:
 
 def test_the_state_is_that_of_the_plant(rig):
   state = rig.arm.get_observation()
-  np.testing.assert_allclose(state.position, rig.state()["position"], atol=1e-6)
+  np.testing.assert_allclose(state.position, rig.ask("state")["position"], atol=1e-6)
   np.testing.assert_allclose(state.velocity, np.zeros(6), atol=1e-4)
   assert not state.fault
   assert 0 <= time.monotonic() - state.time < 0.1
@@ -87,7 +88,7 @@ def test_it_brakes_to_rest_and_starts_again(rig):
     rig.arm.send_action(rest.position)
   rig.arm.start()
   servo(rig.arm, lambda _: start, 1.0)
-  np.testing.assert_allclose(rig.state()["position"], start, atol=1e-3)
+  np.testing.assert_allclose(rig.ask("state")["position"], start, atol=1e-3)
 
 
 @pytest.mark.parametrize("joints", [np.zeros(7), np.full(6, np.nan)])
@@ -115,7 +116,7 @@ def test_start_keeps_the_zero_if_asked_to():
 
 
 def test_the_zero_of_the_wrench_drifts_until_the_next_one(rig):
-  rig.drift_force()
+  rig.ask("drift_force")
   rig.arm.stop()
   np.testing.assert_allclose(rig.arm.get_observation().wrench, DRIFT, atol=1e-3)
   rig.arm.start()
@@ -148,7 +149,7 @@ def test_the_table_pushes_the_tool_up(rig):
 def test_each_fault_is_one_line_in_time(rig, cause, text):
   start = rig.arm.get_observation().position
   servo(rig.arm, lambda _: start, 0.05)
-  getattr(rig, cause)()
+  rig.ask(cause)
   begin = time.monotonic()
   fault = wait_for_fault(rig.arm)
   assert time.monotonic() < begin + 0.5
@@ -159,13 +160,66 @@ def test_each_fault_is_one_line_in_time(rig, cause, text):
   rig.arm.stop()  # Harmless.
 
 
+CLIENT = """
+import sys, time
+from apnpql_jax.robot.drivers.ur5e import UR5e
+arm = UR5e(sys.argv[1], payload_kg=0.5, payload_cog_m=[0, 0, 0.05])
+arm.connect()
+arm.start()
+position = arm.get_observation().position
+while True:
+  position = position + [0.001, 0, 0, 0, 0, 0]
+  arm.send_action(position)
+  time.sleep(0.002)
+"""
+
+
+def test_the_watchdog_stops_the_arm_of_a_client_that_hangs():
+  server = doubles.serve("push_plate", noise=False)
+  host, _ = server.greeting
+  begin = ask(host, "state")["position"][0]
+  with subprocess.Popen([sys.executable, "-c", CLIENT, host]) as client:
+    end = time.monotonic() + 30
+    while ask(host, "state")["position"][0] < begin + 0.1:
+      assert client.poll() is None and time.monotonic() < end
+    client.send_signal(signal.SIGSTOP)
+    end = time.monotonic() + 3 / WATCHDOG
+    while (state := ask(host, "state"))["program_runs"]:
+      assert time.monotonic() < end
+    time.sleep(0.5)  # It brakes.
+    rest = ask(host, "state")["position"]
+    time.sleep(0.3)
+    np.testing.assert_allclose(ask(host, "state")["position"], rest, atol=1e-4)
+    assert rest[0] < state["position"][0] + 0.2
+    client.kill()
+  server.close()
+
+
+def test_the_program_goes_on_at_rest_while_the_arm_is_read(rig):
+  rig.arm.stop()
+  end = time.monotonic() + 3 / WATCHDOG
+  while time.monotonic() < end:
+    rig.arm.get_observation()
+    time.sleep(TIMESTEP)
+  assert rig.ask("state")["program_runs"]
+  time.sleep(2 / WATCHDOG)  # Nobody reads.
+  assert not rig.ask("state")["program_runs"]
+  rig.arm.start()
+  assert rig.ask("state")["program_runs"] and rig.ask("state")["programs"] == 2
+
+
+def test_a_command_that_the_double_lacks_ends_the_program(rig):
+  assert not rig.arm._control.setTcp([0.0] * 6)
+  assert not rig.ask("state")["program_runs"]
+
+
 def test_a_lost_connection_does_not_end_the_process():
   code = """
 import gc, time
 from apnpql_jax.robot import doubles
 with doubles.start("push_plate") as rig:
   rig.arm.start()
-  rig.drop_rtde()
+  rig.ask("drop_rtde")
   time.sleep(0.5)
   rig.arm.disconnect()
   rig.arm = None
@@ -181,14 +235,14 @@ print("alive")
 def test_it_starts_again_after_the_program_stopped(rig):
   start = rig.arm.get_observation().position
   servo(rig.arm, lambda t: start + [0.5 * t, 0, 0, 0, 0, 0], 0.5)
-  rig.stop_program()
+  rig.ask("stop_program")
   wait_for_fault(rig.arm)
   rig.arm.stop()
   time.sleep(0.3)
-  rest = np.array(rig.state()["position"])
+  rest = np.array(rig.ask("state")["position"])
   rig.arm.start()
   time.sleep(0.3)  # A program that obeys the old target would move the arm.
-  np.testing.assert_allclose(rig.state()["position"], rest, atol=1e-4)
+  np.testing.assert_allclose(rig.ask("state")["position"], rest, atol=1e-4)
   servo(rig.arm, lambda t: rest + [0.2 * t, 0, 0, 0, 0, 0], 0.5)
   assert not rig.arm.get_observation().fault
   assert rig.arm.get_observation().position[0] > rest[0] + 0.05
