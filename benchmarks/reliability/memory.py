@@ -34,8 +34,8 @@ from apnpql_jax.runs import leaves, run_folder
 from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
 from apnpql_jax.training import resume
 from apnpql_jax.training.expert import collect_expert
+from apnpql_jax.training.start import needed_memory
 from apnpql_jax.training.state import example_state, initial_state
-from apnpql_jax.training.train import needed_memory
 from benchmarks.common import command, settings, store
 
 TASK = "push_plate"

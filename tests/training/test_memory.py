@@ -18,8 +18,8 @@ from apnpql_jax.runs.checkpoint_writer import CheckpointWriter
 from apnpql_jax.training import resume
 from apnpql_jax.training.expert import collect_expert
 from apnpql_jax.training.iteration import make_iteration
+from apnpql_jax.training.start import needed_memory
 from apnpql_jax.training.state import TrainState, example_state, initial_state
-from apnpql_jax.training.train import needed_memory
 from benchmarks.reliability.memory import memory
 
 CAPACITY = 1_600_000
