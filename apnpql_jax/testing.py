@@ -141,7 +141,7 @@ def export_untrained(
 
   config = EnvConfig(time_limit_s=time_limit_s)
   learner, task = make_agent(agent), make_task(config.task)
-  seen = observation_shapes(config, task, instants=agent.lstm_instants)
+  seen = observation_shapes(config, task, lstm_instants=agent.lstm_instants)
   zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), seen)
   params = learner.init(jax.random.key(1), zeros).params
   shapes = contract.fields(seen)
@@ -154,7 +154,7 @@ def export_untrained(
       "xla_flags": os.environ.get("XLA_FLAGS", ""),
     },
     "acting": {"rule": "policy", "needs_key": made.needs_key},
-    **contract.describe(config, task.scene, shapes, instants=agent.lstm_instants),
+    **contract.describe(config, task.scene, shapes, lstm_instants=agent.lstm_instants),
     "origin": {
       "scene_sha256": task.scene.fingerprint,
       "exported_with": {"packages": {"jaxlib": metadata.version("jaxlib")}},
@@ -172,12 +172,12 @@ def random_batch(
   *,
   pixels: bool = False,
   windows: int = 0,
-  instants: int = 0,
+  lstm_instants: int = 0,
 ) -> Transition:
   """Returns a batch of random transitions, with images if ``pixels``.
 
-  ``windows`` is the N of ``Transition.window``, 0 for none; ``instants`` the number of
-  instants per observation, 0 for single observations.
+  ``windows`` is the N of ``Transition.window``, 0 for none; ``lstm_instants`` the
+  number of instants per observation, 0 for single observations.
   """
   rng = np.random.default_rng(seed)
 
@@ -191,7 +191,7 @@ def random_batch(
     return jnp.asarray(rng.integers(0, 256, shape), jnp.uint8) if pixels else None
 
   def observation(*shape: int) -> Observation:
-    shape += (instants,) * bool(instants)
+    shape += (lstm_instants,) * bool(lstm_instants)
     return Observation(
       robot=normal(*shape, 21),
       tool=0.3 * normal(*shape, 3),

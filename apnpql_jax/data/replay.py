@@ -115,7 +115,7 @@ def sample(
   n_step: int,
   gamma: float,
   windows: bool = False,
-  instants: int = 0,
+  lstm_instants: int = 0,
 ) -> Transition:
   """Draws N-step transitions uniformly, with replacement, from all valid starts.
 
@@ -126,9 +126,10 @@ def sample(
   ring is too short or all candidates of the batch were used up.
 
   With ``windows``, ``Transition.window`` holds the N instants after the start; they
-  repeat the end of an episode. With ``instants`` L > 0, observations are [B, L, ...].
+  repeat the end of an episode. With ``lstm_instants`` L > 0, observations are
+  [B, L, ...].
   """
-  before = max(instants - 1, 0)
+  before = max(lstm_instants - 1, 0)
   time, world, valid = _draw_starts(replay, key, batch_size, n_step, before)
   length, timestep = replay.slots.action.shape[0], replay.slots.timestep
   steps = jnp.arange(n_step)[None, :]
@@ -143,7 +144,7 @@ def sample(
   ended = jnp.take_along_axis(terminated, stop[:, None], axis=1)[:, 0]
   # Gather the start, the state to bootstrap from, and the window between them.
   window = (time[:, None] + 1 + jnp.minimum(steps, stop[:, None])) % length
-  slots_at = functools.partial(_slots, replay, instants=instants)
+  slots_at = functools.partial(_slots, replay, lstm_instants=lstm_instants)
   start, end = slots_at(time, world), slots_at(window[:, -1], world)
   return Transition(
     observation_tm1=start.timestep.observation,
@@ -175,7 +176,7 @@ def sample_mixed(
   n_step: int,
   gamma: float,
   windows: bool = False,
-  instants: int = 0,
+  lstm_instants: int = 0,
 ) -> Transition:
   """Draws a batch from both replays: agent rows first, then ``expert_count`` rows.
 
@@ -187,7 +188,7 @@ def sample_mixed(
     raise ValueError(f"expert_share {expert_share} needs an expert replay")
   counts = ((agent_replay, batch_size - from_expert), (expert_replay, from_expert))
   draw = functools.partial(
-    sample, n_step=n_step, gamma=gamma, windows=windows, instants=instants
+    sample, n_step=n_step, gamma=gamma, windows=windows, lstm_instants=lstm_instants
   )
   parts = [
     draw(replay, part_key, batch_size=count)
@@ -220,23 +221,23 @@ def _draw_starts(
   return time[kept], world[kept], valid[kept]
 
 
-def _slots(replay: Replay, time: Array, world: Array, *, instants: int) -> Slot:
+def _slots(replay: Replay, time: Array, world: Array, *, lstm_instants: int) -> Slot:
   """Gathers slots at (time, world) [*b], with observations [*b, L, ...] for L instants.
 
   The slot after the latest earlier end is the first of the episode. If the episode is
   shorter than L, its first observation is repeated.
   """
   slots = _gather(replay.slots, time, world)
-  if not instants:
+  if not lstm_instants:
     return slots
   length, timestep = replay.slots.action.shape[0], replay.slots.timestep
   world = world[..., None]
-  earlier = jnp.stack([time - 1 - k for k in range(instants)], axis=-1) % length
+  earlier = jnp.stack([time - 1 - k for k in range(lstm_instants)], axis=-1) % length
   flags = (timestep.terminated, timestep.truncated)
   terminated, truncated = _gather(flags, earlier, world)
   # Count earlier slots of the episode; the last column means "L - 1 or more".
   before = jnp.argmax((terminated | truncated).at[..., -1].set(True), axis=-1)
-  past = [time - jnp.minimum(k, before) for k in reversed(range(instants))]
+  past = [time - jnp.minimum(k, before) for k in reversed(range(lstm_instants))]
   recent = _gather(timestep.observation, jnp.stack(past, axis=-1) % length, world)
   return slots.replace(timestep=slots.timestep.replace(observation=recent))
 

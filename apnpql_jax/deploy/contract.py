@@ -46,7 +46,7 @@ MEANINGS = {
 
 
 def describe(
-  config: EnvConfig, scene: Scene, shapes: dict[str, Any], *, instants: int
+  config: EnvConfig, scene: Scene, shapes: dict[str, Any], *, lstm_instants: int
 ) -> Json:
   """Returns the parts of the contract that come from the scene and the settings.
 
@@ -54,7 +54,7 @@ def describe(
     config: The environment of the run.
     scene: The scene of its task.
     shapes: ShapeDtypeStructs of an observation with a batch axis of 1, by field.
-    instants: L of ``EnvState.recent``; 0 without an LSTM.
+    lstm_instants: L of ``EnvState.recent``; 0 without an LSTM.
   """
   model = scene.model
   data = mujoco.MjData(model)
@@ -64,7 +64,7 @@ def describe(
     "task": config.task,
     "control_period_s": config.control_period_s,
     "time_limit_s": config.time_limit_s,
-    "observation": _observation(shapes, instants),
+    "observation": _observation(shapes, lstm_instants),
     "action": _action(model, scene),
     "joints": _joints(model, scene),
     "frames": _frames(data, scene),
@@ -88,7 +88,7 @@ def hash_of(params: Params) -> str:
   return digest.hexdigest()
 
 
-def _observation(shapes: dict[str, Any], instants: int) -> Json:
+def _observation(shapes: dict[str, Any], lstm_instants: int) -> Json:
   fields = {
     name: {
       "shape": list(x.shape[1:]),
@@ -98,9 +98,9 @@ def _observation(shapes: dict[str, Any], instants: int) -> Json:
     for name, x in shapes.items()
   }
   about: Json = {"batch": 1, "fields": fields}
-  if instants:
+  if lstm_instants:
     about["instants"] = {
-      "count": instants,
+      "count": lstm_instants,
       "meaning": "first axis of every field: the last observations, oldest first; an "
       "episode of fewer instants repeats its first",
     }

@@ -63,8 +63,10 @@ def export(
   devices.start()
   task = tasks.make_task(config.env.task)
   agent, params, step = load_agent(run_dir, config, task, step=step)
-  instants = config.agent.lstm_instants
-  shapes = contract.fields(observation_shapes(config.env, task, instants=instants))
+  lstm_instants = config.agent.lstm_instants
+  shapes = contract.fields(
+    observation_shapes(config.env, task, lstm_instants=lstm_instants)
+  )
   act = program.make_act(agent, params, acting=acting)
   exported = program.export(act, shapes)
   about = {
@@ -79,7 +81,7 @@ def export(
       "xla_flags": os.environ.get("XLA_FLAGS", ""),
     },
     "acting": {"rule": acting, "needs_key": exported.needs_key},
-    **contract.describe(config.env, task.scene, shapes, instants=instants),
+    **contract.describe(config.env, task.scene, shapes, lstm_instants=lstm_instants),
     "origin": _origin(run_dir, config, step)
     | {
       "params_sha256": contract.hash_of(params),

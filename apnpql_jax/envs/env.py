@@ -65,15 +65,16 @@ class Env:
     bank: ResetBank,
     mesh: Mesh | None = None,
     *,
-    instants: int = 0,
-    imitated: bool = False,
+    lstm_instants: int = 0,
+    label_expert: bool = False,
   ):
     """Builds the engine and the cameras; see ``make_env``."""
     scene = task.scene
     self.config, self.task, self.mesh = config, task, mesh
     substeps = _substeps(config, scene)
     self.physics = engines.make_physics(config.backend, scene, substeps=substeps)
-    self._bank, self._instants, self._imitated = bank, instants, imitated
+    self._bank, self._lstm_instants = bank, lstm_instants
+    self._label_expert = label_expert
     self._chain = arm.make_chain(scene)
     self._kinematics = make_kinematics(scene)
     self._cameras = make_cameras(config, scene) if config.obs == "pixels" else ()
@@ -89,7 +90,9 @@ class Env:
     if self.mesh is None:
       return self
     parts = self.config, self.task, self._bank
-    return Env(*parts, instants=self._instants, imitated=self._imitated)
+    return Env(
+      *parts, lstm_instants=self._lstm_instants, label_expert=self._label_expert
+    )
 
   @property
   def bank_split(self) -> int:
@@ -130,7 +133,7 @@ class Env:
       faults=jnp.zeros(count, jnp.int32),
       recent=None,
     )
-    if not self._instants:
+    if not self._lstm_instants:
       return first
     # Only shapes matter: ``observe`` overwrites the values where an episode begins.
     shapes = jax.eval_shape(self._observe, first).timestep.observation
@@ -209,7 +212,7 @@ class Env:
 
   def _repeated(self, x: Array) -> Array:
     """Repeats L times, [worlds, ...] -> [worlds, L, ...]."""
-    return jnp.repeat(x[:, None], self._instants, axis=1)
+    return jnp.repeat(x[:, None], self._lstm_instants, axis=1)
 
   def _initial(self, rows: Array, keys: PRNGKeyArray | None) -> PhysicsState:
     """Returns worlds at rest at rows of the bank, randomized if configured."""
@@ -251,7 +254,9 @@ class Env:
       terminated=solved,
       truncated=late & ~solved,
       primitives=primitives,
-      expert=self.task.expert(state, kinematics, tracked) if self._imitated else None,
+      expert=self.task.expert(state, kinematics, tracked)
+      if self._label_expert
+      else None,
     )
     return EnvState(state, targets, arrival.elapsed, timestep, arrival.faults)
 
@@ -289,8 +294,8 @@ def make_env(
   config: EnvConfig,
   mesh: Mesh | None = None,
   *,
-  instants: int = 0,
-  imitated: bool = False,
+  lstm_instants: int = 0,
+  label_expert: bool = False,
   bank_seed: int = reset_bank.SEED,
 ) -> Env:
   """Builds the worlds of ``config.task``, and its reset bank on first use.
@@ -298,9 +303,9 @@ def make_env(
   Args:
     config: Settings of the environment.
     mesh: Devices that share the worlds; the default device if None.
-    instants: ``agent.lstm_instants`` of the agent that acts in it: L of
+    lstm_instants: ``agent.lstm_instants`` of the agent that acts in it: L of
       ``EnvState.recent``.
-    imitated: Whether ``TimeStep.expert`` is wanted.
+    label_expert: Whether ``TimeStep.expert`` is wanted.
     bank_seed: Seed of the reset states; training uses the default.
 
   Raises:
@@ -321,17 +326,22 @@ def make_env(
     tracked = dict(static_targets=False, obs="state", randomize=False)
     plain = Env(dataclasses.replace(config, **tracked), task, bank)
     bank = with_static_targets(bank, plain)
-  return Env(config, task, bank, mesh, instants=instants, imitated=imitated)
+  return Env(
+    config, task, bank, mesh, lstm_instants=lstm_instants, label_expert=label_expert
+  )
 
 
-def observation_shapes(config: EnvConfig, task: Task, *, instants: int) -> Observation:
+def observation_shapes(
+  config: EnvConfig, task: Task, *, lstm_instants: int
+) -> Observation:
   """Returns ``EnvState.observation`` of one world as shapes, without building worlds.
 
-  ``instants`` is L of ``EnvState.recent``.
+  ``lstm_instants`` is L of ``EnvState.recent``.
   """
+  recent = (lstm_instants,) if lstm_instants else ()
 
   def shapes(*shape: int, dtype: type = jnp.float32) -> Any:
-    return jax.ShapeDtypeStruct((1, *((instants,) if instants else ()), *shape), dtype)
+    return jax.ShapeDtypeStruct((1, *recent, *shape), dtype)
 
   observation = Observation(robot=shapes(HISTORY * 7), tool=shapes(3))
   if config.true_primitives:

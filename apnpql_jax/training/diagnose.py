@@ -138,7 +138,9 @@ def make_recorder(
 
   @jax.jit
   def record(params: Any, rows: Array, key: PRNGKeyArray) -> Instants:
-    def period(carry, key):
+    def period(
+      carry: tuple[EnvState, Array], key: PRNGKeyArray
+    ) -> tuple[tuple[EnvState, Array], Instants]:
       state, running = carry
       act_key, env_key = jax.random.split(key)
       running &= state.faults == 0  # What follows is another episode.

@@ -181,8 +181,8 @@ def load_trained(
   if bank_seed != reset_bank.SEED:
     rows = max(MIN_BANK_ROWS, math.ceil(held_out / HELD_OUT_SHARE))
     env_config = dataclasses.replace(env_config, bank_rows=rows)
-  instants = config.agent.lstm_instants
-  env = make_env(env_config, instants=instants, bank_seed=bank_seed)
+  lstm_instants = config.agent.lstm_instants
+  env = make_env(env_config, lstm_instants=lstm_instants, bank_seed=bank_seed)
   return Trained(config, env, *loaded)
 
 
@@ -195,7 +195,9 @@ def load_agent(
     The agent, the parameters that act, and the step of the checkpoint.
   """
   agent = make_agent(config.agent)
-  shapes = observation_shapes(config.env, task, instants=config.agent.lstm_instants)
+  shapes = observation_shapes(
+    config.env, task, lstm_instants=config.agent.lstm_instants
+  )
   learner = jax.eval_shape(agent.init, jax.random.key(0), shapes)
   devices.check_memory(leaves.nbytes(learner.target_params), "the network")
   return agent, *load_params(run_dir, config, learner.target_params, step)

@@ -129,7 +129,7 @@ def _parse(origin: Path | str) -> tuple[Path, int | None]:
 def _example(config: TrainConfig, mesh: Mesh | None) -> dict[str, Any]:
   """Returns path -> ShapeDtypeStruct of the weights, replicated over the devices."""
   observation = observation_shapes(
-    config.env, make_task(config.env.task), instants=config.agent.lstm_instants
+    config.env, make_task(config.env.task), lstm_instants=config.agent.lstm_instants
   )
   agent = make_agent(config.agent)
   learner: LearnerState = jax.eval_shape(agent.init, jax.random.key(0), observation)

@@ -112,7 +112,7 @@ def make_sample(config: TrainConfig, agent: Agent, mesh: Mesh | None = None) -> 
     n_step=config.agent.n_step,
     gamma=config.agent.gamma,
     windows=agent.policy_evaluation.windows,
-    instants=config.agent.lstm_instants,
+    lstm_instants=config.agent.lstm_instants,
   )
   if mesh is None:
     return draw

@@ -279,8 +279,12 @@ def _build(
 ) -> tuple[Env, Agent, futures.Future[Iteration], TrainState]:
   """Returns worlds, agent, iteration and the state's shapes; checks what they take."""
   agent = make_agent(config.agent)  # Before the worlds, which can take minutes.
-  instants, imitated = config.agent.lstm_instants, table_one.imitates(config.agent)
-  env = make_env(config.env, mesh, instants=instants, imitated=imitated)
+  env = make_env(
+    config.env,
+    mesh,
+    lstm_instants=config.agent.lstm_instants,
+    label_expert=table_one.imitates(config.agent),
+  )
   example = example_state(config, env, agent)
   devices.check_memory(needed_memory(example), "the training")
   if warning := run_folder.check_disk(run_dir, *disk_bytes(config, example, resumed)):

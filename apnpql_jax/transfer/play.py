@@ -62,7 +62,7 @@ def play(
   key: PRNGKeyArray,
   *,
   draw: Draw | None = None,
-  instants: int = 0,
+  lstm_instants: int = 0,
   advance: Advance | None = None,
 ) -> Played:
   """Plays one episode per row of the bank; a world that breaks counts as failed.
@@ -73,7 +73,7 @@ def play(
     rows: Rows of the bank, i32[worlds].
     key: Key of actions and resets.
     draw: Draws the images; those of ``env``, if any, if None.
-    instants: L of ``EnvState.recent``, with ``draw``.
+    lstm_instants: L of ``EnvState.recent``, with ``draw``.
     advance: Runs the physics; that of ``env`` if None.
   """
   count = len(rows)
@@ -94,8 +94,8 @@ def play(
     if draw is not None:
       images = draw(state.physics, np.asarray(rows), running, time)
       seen = with_images(state.timestep.observation, images)
-      if instants:
-        recent = _pushed(recent, seen, instants)
+      if lstm_instants:
+        recent = _pushed(recent, seen, lstm_instants)
         seen = recent
     key, policy_key, env_key = jax.random.split(key, 3)
     action = act(state, seen, policy_key)
@@ -120,10 +120,10 @@ def with_images(observation: Observation, images: tuple[Array, Array]) -> Observ
   return observation.replace(objects=None, global_image=overview, wrist_image=wrist)
 
 
-def _pushed(recent: Any, new: Any, instants: int) -> Any:
+def _pushed(recent: Any, new: Any, lstm_instants: int) -> Any:
   """Returns the last observations [worlds, L, ...]; the first one is repeated."""
   if recent is None:
-    return jax.tree.map(lambda x: jnp.repeat(x[:, None], instants, axis=1), new)
+    return jax.tree.map(lambda x: jnp.repeat(x[:, None], lstm_instants, axis=1), new)
   return jax.tree.map(
     lambda old, x: jnp.concatenate([old[:, 1:], x[:, None]], axis=1), recent, new
   )

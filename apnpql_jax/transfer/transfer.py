@@ -98,10 +98,10 @@ def transfer(
   conditions = of_run(
     run_dir, config, step, cell, acting=acting, episodes=episodes, seed=seed
   )
-  instants = config.agent.lstm_instants
+  lstm_instants = config.agent.lstm_instants
   outside = cell.renderer != "rays"
   obs = "state" if outside else "pixels"  # Others draw the images.
-  env = _make_env(config.env, cell, obs, instants=0 if outside else instants)
+  env = _make_env(config.env, cell, obs, lstm_instants=0 if outside else lstm_instants)
   rule = conditions["acting"]
   choose = jax.jit(lambda p, seen, key: agent.act(p, seen, key, acting=rule)[0])
 
@@ -111,8 +111,10 @@ def transfer(
 
   with contextlib.ExitStack() as stack:
     draw = _draw_of(env, cell, stack)
-    instants = instants if draw else 0
-    played = _play_all(env, cell, act, episodes, seed, draw=draw, instants=instants)
+    lstm_instants = lstm_instants if draw else 0
+    played = _play_all(
+      env, cell, act, episodes, seed, draw=draw, lstm_instants=lstm_instants
+    )
     filmed = _filmed(env, played, video, draw)
   return _summary(conditions, played, began) | filmed
 
@@ -133,7 +135,7 @@ def transfer_expert(
   began, video = time.monotonic(), None if video is None else check_video(video)
   cell.check()
   check_count(episodes, seed)
-  env = _make_env(env_config, cell, "state", instants=0)
+  env = _make_env(env_config, cell, "state", lstm_instants=0)
   choose = jax.jit(env.expert_action)
 
   def act(state: EnvState, seen: Any, key: Array) -> Array:
@@ -196,14 +198,14 @@ def _filmed(
   return found
 
 
-def _make_env(config: EnvConfig, cell: Cell, obs: str, *, instants: int) -> Env:
+def _make_env(config: EnvConfig, cell: Cell, obs: str, *, lstm_instants: int) -> Env:
   devices.start()
   # With Bullet, the environment only starts and observes the worlds.
   backend = "native" if cell.physics == "bullet" else cell.physics
   config = dataclasses.replace(
     config, backend=backend, randomize=cell.looks == "trained", obs=obs
   )
-  return make_env(config, instants=instants)
+  return make_env(config, lstm_instants=lstm_instants)
 
 
 def _play_all(

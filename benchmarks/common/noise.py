@@ -16,7 +16,7 @@ from apnpql_jax.types import Array, Transition
 
 def transitions(config: TrainConfig) -> Transition:
   """Draws the batch of one update: images, flags and numbers within [0, 1)."""
-  env = make_env(config.env, instants=config.agent.lstm_instants)
+  env = make_env(config.env, lstm_instants=config.agent.lstm_instants)
   agent = make_agent(config.agent)
   state = example_state(config, env, agent)
   sample = make_sample(config, agent)

@@ -30,7 +30,7 @@ def main() -> None:
 
 def measure(config: TrainConfig, repeats: int) -> dict[str, Any]:
   """Returns the figures of one setting."""
-  env = make_env(config.env, instants=config.agent.lstm_instants)
+  env = make_env(config.env, lstm_instants=config.agent.lstm_instants)
   agent = make_agent(config.agent)
   worlds, length = config.env.worlds, config.rollout_length
   updates = config.updates_per_iteration

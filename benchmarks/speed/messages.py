@@ -47,7 +47,7 @@ def main() -> None:
 def measure(config: TrainConfig, count: int) -> dict[str, int]:
   """Returns the bytes of an update's messages, and of what they consist of."""
   mesh = devices.make_mesh(count)
-  env = make_env(config.env, mesh, instants=config.agent.lstm_instants)
+  env = make_env(config.env, mesh, lstm_instants=config.agent.lstm_instants)
   agent = make_agent(config.agent)
   state = example_state(config, env, agent)
   sample = make_sample(config, agent, mesh)

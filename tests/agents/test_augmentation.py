@@ -106,7 +106,7 @@ def test_only_images_change_and_each_independently():
 
 def test_images_of_one_window_change_identically():
   """Three equal instants stay equal but change."""
-  batch = random_batch(0, 4, pixels=True, windows=2, instants=3)
+  batch = random_batch(0, 4, pixels=True, windows=2, lstm_instants=3)
   batch = jax.tree.map(
     lambda x: x[..., :1, :, :, :].repeat(3, -4) if x.dtype == np.uint8 else x, batch
   )

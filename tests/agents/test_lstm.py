@@ -61,7 +61,7 @@ def error_after_learning(instants: int) -> float:
   agent = make_agent(dataclasses.replace(CONFIG, lstm_instants=instants))
   ring = episodes()
   draw = functools.partial(
-    replay.sample, ring, batch_size=32, n_step=1, gamma=0.9, instants=instants
+    replay.sample, ring, batch_size=32, n_step=1, gamma=0.9, lstm_instants=instants
   )
 
   def update(state, key):
@@ -89,7 +89,7 @@ def test_an_update_from_images_of_several_instants_trains_the_lstm():
     CONFIG, lstm_instants=2, policy_evaluation="retrace", image_shift=2
   )
   agent = make_agent(config)
-  batch = random_batch(0, 4, pixels=True, windows=3, instants=2)
+  batch = random_batch(0, 4, pixels=True, windows=3, lstm_instants=2)
   with jax.numpy_rank_promotion("raise"):
     state = call(agent.init, jax.random.key(0), batch.observation_tm1)
     after, metrics = call(agent.update, state, batch, jax.random.key(1))

@@ -205,7 +205,7 @@ def test_observations_of_several_instants_are_of_one_episode(instants: int):
       n_step=3,
       gamma=GAMMA,
       windows=True,
-      instants=instants,
+      lstm_instants=instants,
     )
   )
   starts = batch.observation_tm1.robot[:, -1].astype(int)

@@ -95,7 +95,7 @@ def test_same_bits_in_a_process_without_the_package(
   config = dataclasses.replace(testing.SMALL, **settings)
   agent, task = make_agent(config), make_task("push_plate")
   instants = config.lstm_instants
-  seen = observation_shapes(EnvConfig(), task, instants=instants)
+  seen = observation_shapes(EnvConfig(), task, lstm_instants=instants)
   params = agent.init(jax.random.key(1), zeros(seen)).params
   shapes = contract.fields(seen)
   made = program.export(program.make_act(agent, params, acting=acting), shapes)
@@ -183,8 +183,8 @@ def test_a_program_that_calls_this_process_is_refused():
 def test_contract_projects_points_to_the_pixels_where_they_are_seen(camera):
   task, config = make_task("stack_box"), EnvConfig(task="stack_box")
   scene = task.scene
-  shapes = contract.fields(observation_shapes(config, task, instants=0))
-  about = contract.describe(config, scene, shapes, instants=0)
+  shapes = contract.fields(observation_shapes(config, task, lstm_instants=0))
+  about = contract.describe(config, scene, shapes, lstm_instants=0)
   data = mujoco.MjData(scene.model)
   data.qpos[:] = scene.keyframe("neutral")
   data.qpos[scene.arm_qpos] += [0.1, 0.2, 0.1, -0.4, 0.1, 0.0]
@@ -232,7 +232,7 @@ def pose(shown: dict) -> tuple[np.ndarray, np.ndarray]:
 
 def test_contract_names_joints_limits_and_tool():
   task, config = make_task("push_plate"), EnvConfig()
-  about = contract.describe(config, task.scene, {}, instants=0)
+  about = contract.describe(config, task.scene, {}, lstm_instants=0)
   assert about["joints"]["state"][:3] == ["shoulder_pan", "shoulder_lift", "elbow"]
   assert about["action"]["order"][-1] == "gripper"
   assert about["control_period_s"] == 0.15 and about["cameras"] == {}

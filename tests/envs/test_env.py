@@ -93,8 +93,8 @@ def test_density_of_the_expert_is_that_of_its_noise(env, noise: float):
 
 
 def test_the_action_of_the_expert_is_a_label_where_it_is_imitated(env):
-  imitated = Env(env.config, env.task, env._bank, imitated=True)
-  state = imitated.reset(jnp.arange(4))
+  labeled = Env(env.config, env.task, env._bank, label_expert=True)
+  state = labeled.reset(jnp.arange(4))
   np.testing.assert_array_equal(state.timestep.expert, env.expert_action(state))
   assert env.reset(jnp.arange(4)).timestep.expert is None
 
@@ -102,7 +102,10 @@ def test_the_action_of_the_expert_is_a_label_where_it_is_imitated(env):
 def test_static_targets_do_not_follow_a_plate_that_moves(env):
   """The labels lead to where the plate was; the expert still acts on where it is."""
   static = Env(
-    dataclasses.replace(CONFIG, static_targets=True), env.task, env._bank, imitated=True
+    dataclasses.replace(CONFIG, static_targets=True),
+    env.task,
+    env._bank,
+    label_expert=True,
   )
   rows, joints = jnp.arange(8), env.task.scene.arm_qpos
   at, _ = env.task.scene.free_joint("plate")
@@ -134,7 +137,7 @@ def test_true_primitives_are_observed_if_wanted(env):
   timestep = Env(config, env.task, env._bank).reset(jnp.arange(4)).timestep
   np.testing.assert_array_equal(timestep.observation.primitives, timestep.primitives)
   assert env.reset(jnp.arange(4)).observation.primitives is None
-  shapes: Any = observation_shapes(config, env.task, instants=0)
+  shapes: Any = observation_shapes(config, env.task, lstm_instants=0)
   assert shapes.primitives.shape == (1, 3, 7)
 
 
@@ -162,7 +165,7 @@ def test_time_out_truncates_then_resets(env):
 
 def test_the_replay_returns_the_observations_that_the_lstm_acted_on(env):
   """Windows of three instants, in episodes of four."""
-  short = Env(SHORT, env.task, env._bank, instants=3)
+  short = Env(SHORT, env.task, env._bank, lstm_instants=3)
 
   def velocity(observation: Observation) -> jax.Array:
     """Maps observations to f32[b], different for other values or another order."""
@@ -183,7 +186,9 @@ def test_the_replay_returns_the_observations_that_the_lstm_acted_on(env):
     start = short.reset(jnp.arange(16))
     _, chunk = rollout(short, policy, start, key, length=10)
     ring = replay.add(replay.create(example_slot(start), 10, 16), chunk)
-    return replay.sample(ring, key, batch_size=256, n_step=2, gamma=0.9, instants=3)
+    return replay.sample(
+      ring, key, batch_size=256, n_step=2, gamma=0.9, lstm_instants=3
+    )
 
   batch = play(jax.random.key(0))
   observation = batch.observation_tm1

@@ -485,7 +485,7 @@ def test_zero_ranges_equal_no_randomization(plain_env):
 def test_a_step_keeps_the_types_of_the_state(plain_env):
   """One compilation then serves every iteration, and a loop can play episodes."""
   config = dataclasses.replace(CONFIG, obs="pixels", shadows=True, randomize=True)
-  env = Env(config, plain_env.task, plain_env._bank, instants=3)
+  env = Env(config, plain_env.task, plain_env._bank, lstm_instants=3)
   play = make_player(env, lambda noise: expert_policy(env, noise=noise))
   episodes = jax.eval_shape(play, 0.0, jnp.arange(4), jax.random.key(0))
   assert episodes.states.command.shape == (config.episode_steps + 1, FILMED, 7)

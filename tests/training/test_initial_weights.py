@@ -34,8 +34,8 @@ PIXELS = TrainConfig(
 
 
 def learner_of(config: TrainConfig, seed: int = 0) -> Any:
-  task, instants = make_task(config.env.task), config.agent.lstm_instants
-  shapes = observation_shapes(config.env, task, instants=instants)
+  task, lstm_instants = make_task(config.env.task), config.agent.lstm_instants
+  shapes = observation_shapes(config.env, task, lstm_instants=lstm_instants)
   zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
   return make_agent(config.agent).init(jax.random.key(seed), zeros)
 

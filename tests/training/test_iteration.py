@@ -73,8 +73,8 @@ def built(request) -> Built:
     agent=agent,
     max_skipped_updates=2,
   )
-  imitated = imitates(config.agent)
-  env = make_env(config.env, instants=instants, imitated=imitated)
+  label_expert = imitates(config.agent)
+  env = make_env(config.env, lstm_instants=instants, label_expert=label_expert)
   agent = make_agent(config.agent)
   state = initial_state(config, env, agent, collect_expert)
   assert all(x.committed for x in jax.tree.leaves(state))

@@ -84,7 +84,9 @@ def fit_expert(
   """Fits b to the scripted expert in all visited states (DAgger, Ross et al. 2011)."""
   del candidates, key
   if batch.expert_tm1 is None:
-    raise ValueError("there is no expert to imitate: pass imitated=True to make_env")
+    raise ValueError(
+      "there is no expert to imitate: pass label_expert=True to make_env"
+    )
   samples = batch.expert_tm1[None]
   return _fit(heads, prior, samples, jnp.ones(samples.shape[:-1]), nu)
 

@@ -52,7 +52,7 @@ def contract() -> dict[str, Any]:
     f"{name}_image": jax.ShapeDtypeStruct((1, *size, 3), np.uint8)
     for name, size in (("global", config.global_size), ("wrist", config.wrist_size))
   }
-  found = contracts.describe(config, scene, images, instants=0)
+  found = contracts.describe(config, scene, images, lstm_instants=0)
   return json.loads(json.dumps(found))
 
 
