@@ -19,7 +19,7 @@ from apnpql_jax.config import files
 from apnpql_jax.robot.arm_model import FLANGE
 from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.sensor import Sensor
-from apnpql_jax.robot.simulated.plant import Plant, Servo
+from apnpql_jax.robot.simulated.plant import Plant, Servo, moment
 
 SPEED_LIMIT = math.pi  # rad/s, the UR5e's joints, data sheet
 DEVIATION_LIMIT = 0.15  # rad between target and joint, beyond which the arm stops
@@ -139,7 +139,7 @@ class World:
     flange = data.site(FLANGE)
     lever = mass * (data.subtree_com[self._tool] - flange.xpos)
     lever -= payload * (flange.xmat.reshape(3, 3) @ at)
-    weight = (mass - payload) * gravity, np.cross(lever, gravity)
+    weight = (mass - payload) * gravity, moment(lever, gravity)
     return self._plant.wrench() + self._plant.in_base(*weight)
 
 
