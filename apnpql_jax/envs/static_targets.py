@@ -92,7 +92,7 @@ def _end(
   """Plays until episodes end or for a time.
 
   Returns:
-    The joint angles (rad) to which the last action led that counts.
+    The joint angles (rad) after the last action that counts.
   """
   joints, key = env.task.scene.arm_qpos, jax.random.key(0)
 

@@ -24,5 +24,11 @@ def vendor(module: str, package: str) -> Any:
 
 
 def opencv() -> Any:
-  """Returns OpenCV; see ``vendor``."""
-  return vendor("cv2", "opencv-contrib-python-headless")
+  """Returns OpenCV; see ``vendor``. It must have the module of the boards."""
+  cv2 = vendor("cv2", package := "opencv-contrib-python-headless")
+  if not hasattr(cv2, "aruco"):
+    raise DeviceError(
+      f"robot needs {package}>=4.11, and the installed OpenCV {cv2.__version__} lacks "
+      "cv2.aruco: pip install 'apnpql-jax[robot]'"
+    )
+  return cv2

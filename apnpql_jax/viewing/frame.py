@@ -26,7 +26,7 @@ class Hand:
   """Rotation of the tool at the end."""
 
   close: float
-  """Probability that the gripper is told to close."""
+  """Probability of the command to close the gripper."""
 
 
 @dataclasses.dataclass(frozen=True)

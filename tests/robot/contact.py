@@ -2,8 +2,8 @@
 
 The loop: the virtual tool moves, and the real one follows after ``lag``. The contact
 pushes the real tool back with k times its displacement, and the filtered force acts on
-the virtual arm. With one force
-along a direction n this is a loop of one signal, with the transfer function
+the virtual arm. With one force along a direction n this is a loop of one signal, with
+the transfer function
 
   a k e^(-s lag) / (1 + s T) n^T J (M s^2 + (25 M + a J^T D_c J) s)^-1 J^T n
 

@@ -80,3 +80,9 @@ def test_a_missing_package_is_one_line(monkeypatch):
   monkeypatch.setitem(sys.modules, "cv2", None)
   with pytest.raises(DeviceError, match="robot needs opencv-contrib-python-headless"):
     boards.detect(Board(), np.zeros((9, 9, 3), np.uint8))
+
+
+def test_an_opencv_without_the_boards_is_one_line(monkeypatch):
+  monkeypatch.delattr(pytest.importorskip("cv2"), "aruco")
+  with pytest.raises(DeviceError, match=r">=4.11, .* lacks cv2.aruco"):
+    boards.detect(Board(), np.zeros((9, 9, 3), np.uint8))
