@@ -19,14 +19,14 @@ from apnpql_jax.robot import devices
 from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.check.table import Table
 from apnpql_jax.robot.devices import Robot
-from apnpql_jax.robot.limits import Limits, MotionLimiter
+from apnpql_jax.robot.limits import TIMESTEP, Limits, MotionLimiter
 from apnpql_jax.robot.protocols import CAMERAS, ArmState, Frame
 
 _WAIT_S = 5.0
 """Time that a camera may take for its first frame."""
 
-_READINGS = 25
-"""Measurements of a device, of whose ages the median counts."""
+_WATCH_S = 1.0
+"""Time for which a device is watched: in a run, one measurement that is too old ends it."""
 
 Stack = contextlib.ExitStack
 
@@ -39,8 +39,8 @@ def arm(
   with table.row("arm"):
     device = devices.make_arm(robot, reads=True)
     stack.enter_context(devices.connected(device))
-    state, age = _newest(robot, device)
-    table.rows["arm"] = f"{_text(device)}; measured {1e3 * age:.0f} ms ago"
+    state, age = _watch(robot, device)
+    table.rows["arm"] = f"{_text(device)}; measured up to {1e3 * age:.0f} ms ago"
     for problem in _problems(device, state, age, limits):
       table.fail("arm", problem)
     force = ", ".join(f"{x:.1f}" for x in model.base_mat @ state.wrench[:3])
@@ -61,9 +61,9 @@ def gripper(stack: Stack, table: Table, robot: Robot) -> Callable[[], float]:
   with table.row("gripper"):
     device = devices.make_gripper(robot)
     stack.enter_context(devices.connected(device))
-    state, age = _newest(robot, device)
+    state, age = _watch(robot, device)
     angle, most = state.angle, robot.cell.limits(robot.contract).gripper_age
-    measured = f"measured {1e3 * age:.0f} ms ago"
+    measured = f"measured up to {1e3 * age:.0f} ms ago"
     table.rows["gripper"] = f"{_text(device)}; at {angle:.2f} rad, {measured}"
     if age > most:
       table.fail("gripper", f"it was {measured}, the limit is {1e3 * most:.0f} ms")
@@ -95,12 +95,12 @@ def cameras(stack: Stack, table: Table, robot: Robot) -> Callable[[], Sequence[F
 
 
 def ages(table: Table, robot: Robot, found: np.ndarray) -> None:
-  """Adds the ages of the frames to their rows, f64[2], s, if there are frames."""
+  """Adds the greatest ages of the frames, f64[2], s, to their rows, if there are any."""
   if "cameras" in table.failing:
     return
   most = robot.cell.limits(robot.contract).frame_age
   for name, age in zip(CAMERAS, found, strict=True):
-    row, text = f"camera {name}", f"frames of {1e3 * age:.0f} ms when it acts"
+    row, text = f"camera {name}", f"frames of up to {1e3 * age:.0f} ms when it acts"
     if age > most:
       table.fail(row, f"{text}, the limit is {1e3 * most:.0f} ms")
     else:
@@ -114,14 +114,16 @@ def _dark(robot: Robot) -> Sequence[Frame]:
   return [Frame(now, np.zeros(size, np.uint8)) for size in sizes]
 
 
-def _newest(robot: Robot, device: Any) -> tuple[Any, float]:
-  """Returns a measurement of arm or gripper, and the median age of some, s."""
-  found = []
-  for _ in range(_READINGS):
-    state = device.get_observation()
-    found.append(robot.clock.now() - state.time)
-    robot.clock.sleep(0.01)
-  return state, float(np.median(found))
+def _watch(robot: Robot, device: Any) -> tuple[Any, float]:
+  """Reads arm or gripper for a while; returns the last state and the greatest age, s."""
+  clock, oldest = robot.clock, 0.0
+  end = clock.now() + _WATCH_S
+  while True:
+    state, now = device.get_observation(), clock.now()
+    oldest = max(oldest, now - state.time)
+    if now >= end:
+      return state, oldest
+    clock.sleep(TIMESTEP)
 
 
 def _problems(device: Any, state: ArmState, age: float, limits: Limits) -> list[str]:
@@ -130,7 +132,7 @@ def _problems(device: Any, state: ArmState, age: float, limits: Limits) -> list[
   found += getattr(device, "problems", list)()  # Simulated arms have none.
   if age > limits.joint_age:
     found.append(
-      f"its joints were measured {1e3 * age:.0f} ms ago, the limit is "
+      f"its joints were measured up to {1e3 * age:.0f} ms ago, the limit is "
       f"{1e3 * limits.joint_age:.0f} ms: check the network"
     )
   return found

@@ -17,7 +17,9 @@ from apnpql_jax.robot.devices import Robot
 from apnpql_jax.robot.player import Act, Observer
 from apnpql_jax.robot.protocols import Frame
 
-_INSTANTS = 10
+_INSTANTS = 21
+"""Actions, of which the first does not count: nothing is warm yet."""
+
 _ACTION = (7,)
 
 
@@ -42,9 +44,9 @@ def rest(observation: dict[str, np.ndarray], episode: int, instant: int) -> np.n
 
 
 def report(table: Table, robot: Robot, seconds: float) -> None:
-  """Sets the row of a program by the time of an action, s."""
+  """Sets the row of a program by the longest time of an action, s."""
   period = robot.contract["control_period_s"]
-  text = f"{1e3 * seconds:.1f} ms per action, period {1e3 * period:.0f} ms"
+  text = f"up to {1e3 * seconds:.1f} ms per action, period {1e3 * period:.0f} ms"
   table.rows["program"] = text
   if seconds > period:
     table.fail("program", f"{text}: use a faster machine, or give it less to do")
@@ -54,7 +56,7 @@ def try_out(act: Act, robot: Robot, senses: Senses) -> tuple[float, np.ndarray]:
   """Chooses some actions.
 
   Returns:
-    Median time of an action, s, and median ages of both frames when their action was
+    Longest time of an action, s, and greatest ages of both frames when their action was
     chosen, f64[2], s.
 
   Raises:
@@ -72,7 +74,7 @@ def try_out(act: Act, robot: Robot, senses: Senses) -> tuple[float, np.ndarray]:
     seconds.append(now - before)
     ages.append([now - frame.time for frame in frames])
     clock.sleep(begin + period - now)
-  return float(np.median(seconds)), np.median(ages, axis=0)
+  return max(seconds[1:]), np.max(ages[1:], axis=0)
 
 
 def _chosen(act: Act, seen: dict[str, Any], instant: int) -> np.ndarray:
