@@ -26,7 +26,7 @@ _WAIT_S = 5.0
 """Time that a camera may take for its first frame."""
 
 _WATCH_S = 1.0
-"""Time for which a device is watched: in a run, one measurement that is too old ends it."""
+"""Time for which a device is watched: one measurement that is too old ends a run."""
 
 Stack = contextlib.ExitStack
 
@@ -95,7 +95,7 @@ def cameras(stack: Stack, table: Table, robot: Robot) -> Callable[[], Sequence[F
 
 
 def ages(table: Table, robot: Robot, found: np.ndarray) -> None:
-  """Adds the greatest ages of the frames, f64[2], s, to their rows, if there are any."""
+  """Adds the greatest ages of the frames, f64[2], s, to the rows of the cameras."""
   if "cameras" in table.failing:
     return
   most = robot.cell.limits(robot.contract).frame_age
@@ -115,7 +115,7 @@ def _dark(robot: Robot) -> Sequence[Frame]:
 
 
 def _watch(robot: Robot, device: Any) -> tuple[Any, float]:
-  """Reads arm or gripper for a while; returns the last state and the greatest age, s."""
+  """Watches arm or gripper; returns the last state and the greatest age, s."""
   clock, oldest = robot.clock, 0.0
   end = clock.now() + _WATCH_S
   while True:
