@@ -26,8 +26,9 @@ from apnpql_jax.errors import (
   one_line,
 )
 from apnpql_jax.robot import replay
-from apnpql_jax.robot.devices import INTERRUPTS, Robot
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.episodes import Homing, Options, Outcome
+from apnpql_jax.robot.interrupts import INTERRUPTS
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.session import Session
 from apnpql_jax.robot.supervisor import NO_ACTION
