@@ -8,7 +8,7 @@ from typing import Any
 
 import tyro
 
-from apnpql_jax.cli.commands import checkpoint_step, existing_run
+from apnpql_jax.cli.inputs import checkpoint_step, existing_run
 from apnpql_jax.cli.options import Acting, Flag, OfRun
 from apnpql_jax.errors import ConfigError
 
