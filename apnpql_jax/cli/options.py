@@ -69,14 +69,22 @@ class Play(Command):
 
 
 @dataclasses.dataclass(frozen=True)
-class HeldOut(OfRun):
-  """Options of commands that play held-out episodes of a run."""
+class OfCheckpoint(OfRun):
+  """Options of commands that act with a checkpoint of a run."""
 
   run: tyro.conf.Positional[str] = ""
   """Run folder."""
 
   checkpoint: str = "newest"
   """Checkpoint: newest, best (highest success rate in training) or its step."""
+
+  acting: Acting = None
+  """How to choose an action, see `apnpql evaluate --help`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class HeldOut(OfCheckpoint):
+  """Options of commands that play held-out episodes of a run."""
 
   acting: Acting = None
   """How to choose an action: policy draws from the policy; mean takes the component
