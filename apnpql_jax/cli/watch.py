@@ -1,21 +1,16 @@
-"""The command ``watch``: its options, and what it runs."""
+"""The command ``apnpql watch``."""
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from apnpql_jax.cli.commands import (
-  Json,
-  check_free,
-  checkpoint_step,
-  run_config,
-  task_env,
-)
+from apnpql_jax.cli.inputs import checkpoint_step, run_config, task_env
 from apnpql_jax.cli.options import Acting, AsTrained, File, Flag, OfRun
+from apnpql_jax.cli.outputs import check_free
 from apnpql_jax.console import print_line
 from apnpql_jax.errors import ConfigError
 
@@ -71,7 +66,7 @@ class Watch(OfRun):
   """Replace the video if it exists."""
 
 
-def watch(args: Watch) -> Json:
+def watch(args: Watch) -> dict[str, Any]:
   """Shows episodes in a browser until Ctrl-C, or writes a video of them."""
   if not args.what:
     raise ConfigError("watch needs a run folder, expert or random: apnpql watch RUN")
