@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -98,11 +99,11 @@ def watch(args: Watch) -> dict[str, Any]:
   check_server(args.host)
   newest = args.checkpoint == "newest"
   session = Session(Player(_actor(args), seed=args.seed), follow=newest)
-  browser = Browser(session, host=args.host, port=args.port)
-  print_line(f"watch at {browser.url}; Ctrl-C ends")
-  if args.host not in LOOPBACK:
-    print_line("everyone who can reach this machine can watch and press the buttons")
-  session.run(browser)
+  with contextlib.closing(Browser(session, host=args.host, port=args.port)) as browser:
+    print_line(f"watch at {browser.url}; Ctrl-C ends")
+    if args.host not in LOOPBACK:
+      print_line("everyone who can reach this machine can watch and press the buttons")
+    session.run(browser)
   return {}
 
 

@@ -32,7 +32,7 @@ from apnpql_jax.robot.interrupts import INTERRUPTS
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.session import Session
 from apnpql_jax.robot.supervisor import NO_ACTION
-from apnpql_jax.runs.metrics import wilson_interval
+from apnpql_jax.runs.success import success_figures
 
 EVENTS = "episodes.jsonl"
 """File in the folder of a log: an episode per line, with each change of the mode."""
@@ -191,12 +191,7 @@ def _summary(
   }
   judged = [x.solved for x in outcomes if x.solved is not None]
   if judged:
-    solved = sum(judged)
-    found |= {
-      "successes": solved,
-      "success_rate": solved / len(judged),
-      "ci95": wilson_interval(solved, len(judged)),
-    }
+    found |= success_figures(sum(judged), len(judged))
   found |= _at_home([x.homing_after for x in outcomes if x.homing_after is not None])
   if options.log is not None and outcomes:
     found["log"] = options.log
