@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 UNWELL = 1  # exit code of a check that found something that must be changed
 INTERRUPTED = 128  # plus the signal number: exit code of a run stopped by a signal
-NOT_READY = 2  # exit code of bad input, and of a check of a robot in which a row fails
+BAD_INPUT = 2  # exit code of bad input, or of a file that cannot be read or written
+NOT_READY = 2  # exit code of a robot check in which a row fails
 FAILED = 3  # exit code of a run that an error stopped, as a full disk or a lost device
 
 

@@ -57,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return result.get("exit_code", 0)
   except (UserError, OSError) as error:  # Errors of the file system name the path.
     print_line(f"apnpql: {' '.join(str(error).split())}")
-    return errors.NOT_READY
+    return errors.BAD_INPUT
   except errors.RunStopped as stop:
     print_line(f"apnpql: {stop}")
     if stop.code == errors.FAILED:

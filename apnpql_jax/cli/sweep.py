@@ -19,9 +19,8 @@ from apnpql_jax.errors import ConfigError, UserError
 from apnpql_jax.reports.groups import differences
 from apnpql_jax.runs import run_folder
 from apnpql_jax.runs.sinks import check_sinks
-from apnpql_jax.sweeps import manifest as states
 from apnpql_jax.sweeps.launcher import Launch, Launcher, LauncherName
-from apnpql_jax.sweeps.manifest import Manifest
+from apnpql_jax.sweeps.manifest import Manifest, find_equal, load_manifest, open_folder
 from apnpql_jax.sweeps.plan import Planned, make_plan
 
 _ROOT = Path("runs")
@@ -132,7 +131,7 @@ def _open(args: Sweep, stack: contextlib.ExitStack) -> Manifest:
       raise ConfigError(
         "--resume names the sweep itself; give only --jobs, --launcher, --slurm"
       )
-    return states.load(args.resume)
+    return load_manifest(args.resume)
   if not args.presets:
     names = ", ".join(files.preset_names())
     raise ConfigError(
@@ -140,12 +139,12 @@ def _open(args: Sweep, stack: contextlib.ExitStack) -> Manifest:
     )
   plan = make_plan(args.presets, args.grid, seeds=args.seeds, options=args.train)
   check_plan(plan)
-  folder = args.out or states.find_equal(_ROOT, plan)
+  folder = args.out or find_equal(_ROOT, plan)
   if folder is None:
     stems = (Path(preset).stem for preset in args.presets)
     name = f"{'-'.join(stems)}-sweep"
     folder = stack.enter_context(run_folder.new_run_dir(name, _ROOT))
-  manifest = states.open_folder(folder, plan)
+  manifest = open_folder(folder, plan)
   check_begun(manifest)
   return manifest
 

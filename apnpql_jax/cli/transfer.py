@@ -20,7 +20,7 @@ EXPERT = "expert"
 class Transfer(OfRun):
   """Plays a policy in another simulator: apnpql transfer RUN [options].
 
-  The scripted expert sees no images. Where it solves less than 95 %, a cell is no
+  The scripted expert sees no images. Where it solves less than 95 %, a condition is no
   evidence about a policy.
 
   apnpql transfer runs/mine --renderer opengl --looks unseen
@@ -76,7 +76,7 @@ class Transfer(OfRun):
 
 
 def transfer(args: Transfer) -> dict[str, Any]:
-  """Plays the episodes of one cell and returns their figures."""
+  """Plays the episodes under one condition and returns the result."""
   if not args.run:
     raise ConfigError(
       "transfer needs a run or expert: apnpql transfer RUN, or apnpql transfer expert "
@@ -92,17 +92,19 @@ def transfer(args: Transfer) -> dict[str, Any]:
   if env_config is None:
     existing_run(args.run, "transfer", args.task_file)
 
-  from apnpql_jax.transfer import transfer as playing  # Imports JAX.
-  from apnpql_jax.transfer.cell import Cell
+  from apnpql_jax.transfer import evaluation  # Imports JAX.
+  from apnpql_jax.transfer.condition import Condition
 
-  names = [field.name for field in dataclasses.fields(Cell)]
-  cell = Cell(**{name: getattr(args, name) for name in names})
+  names = [field.name for field in dataclasses.fields(Condition)]
+  condition = Condition(**{name: getattr(args, name) for name in names})
   options: dict[str, Any] = {
     "episodes": args.episodes,
     "seed": args.seed,
     "video": args.video,
   }
   if env_config is not None:
-    return playing.transfer_expert(env_config, cell, **options)
+    return evaluation.evaluate_expert(env_config, condition, **options)
   step = checkpoint_step(args.run, args.checkpoint)
-  return playing.transfer(args.run, cell, step=step, acting=args.acting, **options)
+  return evaluation.evaluate_run(
+    args.run, condition, step=step, acting=args.acting, **options
+  )

@@ -85,25 +85,24 @@ def watch(args: Watch) -> dict[str, Any]:
 
   check_count(args.episodes, args.seed)
   if args.video is not None:
-    from apnpql_jax.viewing.film import WIDE, film
+    from apnpql_jax.viewing import watch_video
 
     path = check_video(args.video)
-    written, solved = film(
-      Player(_actor(args), seed=args.seed, wide=WIDE), path, episodes=args.episodes
-    )
+    player = Player(_actor(args), seed=args.seed, wide=watch_video.WIDE)
+    written, solved = watch_video.record(player, path, episodes=args.episodes)
     return {"video": str(written), "episodes": args.episodes, "solved": solved}
 
-  from apnpql_jax.viewing.browser import Browser, check_server
-  from apnpql_jax.viewing.session import Session
+  from apnpql_jax.viewing.live_view import LiveView, check_server
+  from apnpql_jax.viewing.playback import Playback
 
   check_server(args.host)
   newest = args.checkpoint == "newest"
-  session = Session(Player(_actor(args), seed=args.seed), follow=newest)
-  with contextlib.closing(Browser(session, host=args.host, port=args.port)) as browser:
-    print_line(f"watch at {browser.url}; Ctrl-C ends")
+  playback = Playback(Player(_actor(args), seed=args.seed), follow=newest)
+  with contextlib.closing(LiveView(playback, host=args.host, port=args.port)) as view:
+    print_line(f"watch at {view.url}; Ctrl-C ends")
     if args.host not in LOOPBACK:
       print_line("everyone who can reach this machine can watch and press the buttons")
-    session.run(browser)
+    playback.run(view)
   return {}
 
 

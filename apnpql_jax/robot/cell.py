@@ -131,7 +131,7 @@ _KINDS = {
 }
 
 
-def load(path: Path) -> Cell:
+def load_cell(path: Path) -> Cell:
   """Reads and checks the file of a cell.
 
   Raises:

@@ -9,8 +9,9 @@ import importlib
 from pathlib import Path
 
 from apnpql_jax.errors import ConfigError
-from apnpql_jax.robot import cell as cells, devices
+from apnpql_jax.robot import devices
 from apnpql_jax.robot.arm_model import ArmModel
+from apnpql_jax.robot.cell import Cell, load_cell
 from apnpql_jax.robot.clock import Clock
 from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.limits import MotionLimiter
@@ -45,7 +46,7 @@ def describe(
     ConfigError: The cell is invalid, has no calibration or that of other cameras, or
       does not contain the neutral pose; or the scene of the task has changed.
   """
-  cell = cells.load(path) if kind == "ur5e" else cells.Cell()
+  cell = load_cell(path) if kind == "ur5e" else Cell()
   robot = Robot(kind, policy.contract, cell, Clock(slowdown))
   limits, model = cell.limits(policy.contract), ArmModel()
   outside = MotionLimiter(limits, model.tool_position).outside(policy.neutral)

@@ -11,21 +11,23 @@ from typing import Any, TextIO
 
 from apnpql_jax.console import Unfailing
 from apnpql_jax.reports.tables import Rows
-from apnpql_jax.sweeps import manifest as states
 from apnpql_jax.sweeps.following import Follower
-from apnpql_jax.sweeps.manifest import Entry, Manifest
+from apnpql_jax.sweeps.manifest import (
+  DONE,
+  FAILED,
+  RUNNING,
+  STOPPED,
+  WAITING,
+  Entry,
+  Manifest,
+)
 
-_ORDER = (states.RUNNING, states.FAILED, states.STOPPED, states.WAITING, states.DONE)
+_ORDER = (RUNNING, FAILED, STOPPED, WAITING, DONE)
 """States from the most to the least interesting."""
 
 _WIDE = 60  # columns of a terminal with room for all columns of the table
 
-_STYLE = {
-  states.RUNNING: "cyan",
-  states.FAILED: "red",
-  states.STOPPED: "yellow",
-  states.DONE: "green",
-}
+_STYLE = {RUNNING: "cyan", FAILED: "red", STOPPED: "yellow", DONE: "green"}
 
 
 class SweepDisplay:
@@ -69,9 +71,9 @@ class SweepDisplay:
     follower = self._followers[entry.name]
     follower.update()
     text = f"{entry.state} {entry.name}"
-    if entry.state == states.DONE and follower.success is not None:
+    if entry.state == DONE and follower.success is not None:
       text += f": {100 * follower.success:.0f} % solved"
-    if entry.state in (states.FAILED, states.STOPPED):
+    if entry.state in (FAILED, STOPPED):
       text += f": {entry.line}"
     self._print(text)
 
@@ -82,12 +84,12 @@ class SweepDisplay:
       return
     self._shown_at = now
     for entry in self._manifest.runs:
-      if entry.state == states.RUNNING:
+      if entry.state == RUNNING:
         self._followers[entry.name].update()
     if self._terminal:
       self._live.update(self._table(), refresh=True)
     else:
-      running = [x for x in self._manifest.runs if x.state == states.RUNNING]
+      running = [x for x in self._manifest.runs if x.state == RUNNING]
       shares = (
         f"{x.name} {100 * self._followers[x.name].share:.0f} %" for x in running
       )
@@ -144,7 +146,7 @@ class SweepDisplay:
         f"{100 * follower.share:.0f} %" if begun else "",
         "" if solved is None else f"{100 * solved:.0f} %",
         f"{follower.seconds / 60:.1f}" if begun else "",
-        f"{left / 60:.1f}" if left and entry.state == states.RUNNING else "",
+        f"{left / 60:.1f}" if left and entry.state == RUNNING else "",
       ][: len(columns)]
       style = _STYLE.get(entry.state, "dim")
       table.add_row(entry.name[cut:], entry.state, *cells, style=style)

@@ -68,7 +68,8 @@ class Manifest:
     Takes jobs and attempts from the file, which another process may have saved since.
     """
     path = self.folder / MANIFEST_FILE
-    saved = {run.name: run for run in load(self.folder).runs} if path.exists() else {}
+    runs = load_manifest(self.folder).runs if path.exists() else []
+    saved = {run.name: run for run in runs}
     for index, entry in enumerate(self.runs):
       if (newer := saved.get(entry.name)) and newer.argv == entry.argv:
         self.runs[index] = newer
@@ -111,7 +112,7 @@ class Manifest:
       return False
 
 
-def load(folder: Path) -> Manifest:
+def load_manifest(folder: Path) -> Manifest:
   """Reads the manifest of a sweep.
 
   Raises:
@@ -141,7 +142,7 @@ def open_folder(folder: Path, plan: Sequence[Planned]) -> Manifest:
     ConfigError: The folder holds something else, or a run with other options.
   """
   if (folder / MANIFEST_FILE).exists():
-    manifest = load(folder)
+    manifest = load_manifest(folder)
   elif folder.exists() and any(folder.iterdir()):
     raise ConfigError(f"{str(folder)!r} holds something else; choose another --out")
   else:
@@ -156,7 +157,7 @@ def find_equal(root: Path, plan: Sequence[Planned]) -> Path | None:
   paths = root.glob(f"*/{MANIFEST_FILE}")
   for path in sorted(paths, key=lambda path: path.stat().st_mtime, reverse=True):
     try:
-      found = load(path.parent)
+      found = load_manifest(path.parent)
     except FileError:
       continue
     if [(entry.name, entry.argv) for entry in found.runs] == wanted:

@@ -9,10 +9,17 @@ import time
 from apnpql_jax.console import reporting
 from apnpql_jax.errors import INTERRUPTED, UserError, one_line
 from apnpql_jax.runs import run_folder
-from apnpql_jax.sweeps import manifest as states
 from apnpql_jax.sweeps.following import last_line
 from apnpql_jax.sweeps.launcher import Job, Launcher
-from apnpql_jax.sweeps.manifest import Entry, Manifest
+from apnpql_jax.sweeps.manifest import (
+  DONE,
+  FAILED,
+  RUNNING,
+  STOPPED,
+  WAITING,
+  Entry,
+  Manifest,
+)
 
 _POLL_S = 0.5
 
@@ -53,14 +60,14 @@ class Runner:
       self._save()
 
   def _waiting(self) -> list[Entry]:
-    return [entry for entry in self._manifest.runs if entry.state == states.WAITING]
+    return [entry for entry in self._manifest.runs if entry.state == WAITING]
 
   def _find_again(self) -> None:
     """Takes over the jobs that an earlier process has left running on a cluster."""
     for entry in self._waiting():
       if job := self._launcher.find(entry.job):
         self._active[entry.name] = entry, job
-        self._change(entry, states.RUNNING)
+        self._change(entry, RUNNING)
 
   def _start(self) -> None:
     """Starts waiting runs while there is room."""
@@ -73,11 +80,11 @@ class Runner:
         job = self._launcher.start(self._manifest.work(entry))
       except (OSError, UserError) as error:
         entry.line = one_line(error)
-        self._change(entry, states.FAILED)
+        self._change(entry, FAILED)
         continue
       entry.job = job.name
       self._active[entry.name] = entry, job
-      self._change(entry, states.RUNNING)
+      self._change(entry, RUNNING)
 
   def _stop(self, number: int) -> None:
     """Lets the active runs save and end, but not those that can be found again."""
@@ -95,14 +102,14 @@ class Runner:
       del self._active[entry.name]
       entry.code, entry.job = code, ""
       if code == 0:
-        self._change(entry, states.DONE)
+        self._change(entry, DONE)
         continue
       entry.line = job.error or last_line(self._manifest.work(entry).log)
       if code < 0:
         entry.line = f"killed by signal {-code}; {entry.line}"
       # SIGTERM kills a run that has just started and does not listen yet.
       stopped = code > INTERRUPTED or code == -signal.SIGTERM
-      self._change(entry, states.STOPPED if stopped else states.FAILED)
+      self._change(entry, STOPPED if stopped else FAILED)
 
   def _change(self, entry: Entry, state: str) -> None:
     entry.state = state

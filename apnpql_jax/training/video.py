@@ -37,12 +37,12 @@ def record_episodes(env: Env, played: Episodes, path: Path) -> Path:
   Returns:
     The path that was written, see ``write_video``.
   """
-  frames = np.concatenate(film(env, played))
+  frames = np.concatenate(render_episodes(env, played))
   path.parent.mkdir(parents=True, exist_ok=True)
   return write_video(path, frames, fps=1 / env.config.control_period_s)
 
 
-def film(env: Env, played: Episodes) -> list[np.ndarray]:
+def render_episodes(env: Env, played: Episodes) -> list[np.ndarray]:
   """Renders the first episodes, u8[T, H, W, 3] each.
 
   The last instant gets a green border if the task was solved, else a red one.

@@ -1,4 +1,4 @@
-"""What the renderers share: cameras, light, colors, and the way to an image."""
+"""Cameras, light, colors and image processing that the renderers share."""
 
 from __future__ import annotations
 

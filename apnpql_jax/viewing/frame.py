@@ -1,4 +1,4 @@
-"""Frames: all that can be seen of one instant of a watched world, in NumPy."""
+"""Frames: everything that is shown of one instant of a watched world, in NumPy."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ COLORS = ("#e8590c", "#099268", "#7048e8")
 
 
 @dataclasses.dataclass(frozen=True)
-class Hand:
-  """Where a primitive leads the tool, in the world; lengths in m."""
+class ToolPath:
+  """Path along which a primitive leads the tool, in the world frame."""
 
-  path: Float[np.ndarray, "points 3"]
-  """Positions of the tool on the way, from the present one."""
+  positions: Float[np.ndarray, "points 3"]
+  """Positions of the tool, from the present one on, m."""
 
   mat: Float[np.ndarray, "3 3"]
-  """Rotation of the tool at the end."""
+  """Rotation of the tool at the end of the path."""
 
   close: float
   """Probability of the command to close the gripper."""
@@ -54,7 +54,7 @@ class Frame:
   action: Float[np.ndarray, " 7"]
   """The action chosen here."""
 
-  hands: tuple[Hand, ...]
+  tool_paths: tuple[ToolPath, ...]
   """One per primitive."""
 
   stage: int

@@ -19,14 +19,14 @@ from apnpql_jax.training.diagnose import expert_stage
 from apnpql_jax.training.evaluate import check_count
 from apnpql_jax.types import ARM_DOF, NUM_PRIMITIVES, Array
 from apnpql_jax.viewing.actors import Actor
-from apnpql_jax.viewing.frame import Frame, Hand
+from apnpql_jax.viewing.frame import Frame, ToolPath
 
 POINTS = 12
-"""Points on the way of a primitive."""
+"""Points on the path of a primitive."""
 
 
 class Player:
-  """Plays held-out episodes of an actor in one world."""
+  """Player of held-out episodes of an actor, in one world."""
 
   def __init__(
     self, actor: Actor, *, seed: int = 0, wide: tuple[int, int] | None = None
@@ -91,7 +91,7 @@ class Player:
       period_s=period_s,
       checkpoint=self.actor.step,
       last=self._last,
-      hands=tuple(map(Hand, *seen.pop("hands"))),
+      tool_paths=tuple(map(ToolPath, *seen.pop("tool_paths"))),
       explanation=jax.device_get(explanation),
       **seen,
     )
@@ -104,7 +104,7 @@ class Player:
     decision = self.actor.decide(params, state, key)
     seen = {
       "action": decision.action,
-      "hands": self._hands(state, decision.primitives),
+      "tool_paths": self._tool_paths(state, decision.primitives),
       "stage": expert_stage(env, state),
       "images": {name: self._image(name, state) for name in self._cameras},
       "poses": env.poses(state.physics),
@@ -123,8 +123,10 @@ class Player:
       return observed
     return self.actor.env.view(self._cameras[name], state.physics)
 
-  def _hands(self, state: EnvState, primitives: Array) -> tuple[Array, Array, Array]:
-    """Returns tool paths f32[worlds, 3, POINTS, 3], last rotations, and closing."""
+  def _tool_paths(
+    self, state: EnvState, primitives: Array
+  ) -> tuple[Array, Array, Array]:
+    """Returns positions f32[worlds, 3, POINTS, 3], last rotations, and closing."""
     scene, physics = self.actor.env.task.scene, state.physics
     q = physics.qpos[:, scene.arm_qpos][:, None]
     velocity = primitives[..., :ARM_DOF].clip(-1.0, 1.0)

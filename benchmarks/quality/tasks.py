@@ -25,7 +25,7 @@ from apnpql_jax.tasks import make_task, task_names
 from apnpql_jax.tasks.contact_report import contact_report
 from apnpql_jax.training.evaluate import evaluate_expert
 from apnpql_jax.training.rollout import FILMED, expert_policy, make_player
-from apnpql_jax.training.video import film, record_episodes
+from apnpql_jax.training.video import record_episodes, render_episodes
 from benchmarks.common import settings, store, tables
 
 RESULTS = store.RESULTS / "tasks"
@@ -76,7 +76,7 @@ def show(env: Env) -> None:
   played = play(None, env.bank_split + jnp.arange(FILMED), jax.random.key(0))
   folder = store.ROOT / "docs" / "tasks"
   record_episodes(env, played, folder / f"{env.task.name}.mp4")
-  episode = film(env, played)[0]
+  episode = render_episodes(env, played)[0]
   chosen = np.linspace(0, len(episode) - 1, INSTANTS).round().astype(int)
   around = (0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN), (0, 0)
   framed = np.pad(episode[chosen], around, constant_values=255)

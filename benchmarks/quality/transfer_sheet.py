@@ -23,10 +23,10 @@ from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.envs.state import EnvState
 from apnpql_jax.training.rollout import expert_policy, rollout
 from apnpql_jax.transfer import looks
-from apnpql_jax.transfer.opengl import OpenGL
-from apnpql_jax.transfer.tiny import Tiny
-from apnpql_jax.transfer.transfer import make_draw
-from apnpql_jax.transfer.worlds import Worlds
+from apnpql_jax.transfer.bullet_worlds import BulletWorlds
+from apnpql_jax.transfer.evaluation import make_draw
+from apnpql_jax.transfer.opengl_renderer import OpenGLRenderer
+from apnpql_jax.transfer.tiny_renderer import TinyRenderer
 from benchmarks.common import store
 from benchmarks.quality.randomization_sheet import PERIODS, WORLDS, tile
 
@@ -49,15 +49,17 @@ def sheet(config: EnvConfig) -> list[np.ndarray]:
   state = played(env)
   seen: Any = state.timestep.observation
   rows = [joined(seen.global_image, seen.wrist_image)]
-  rows.append(drawn(env, state, OpenGL, unseen=()))
+  rows.append(drawn(env, state, OpenGLRenderer, unseen=()))
   randomized = make_env(dataclasses.replace(config, randomize=True))
-  rows.append(drawn(randomized, played(randomized), OpenGL, unseen=()))
-  rows.append(drawn(env, state, OpenGL, unseen=looks.PARTS))
-  with Worlds(env, latency_s=0.03, admittance=False) as worlds:
+  rows.append(drawn(randomized, played(randomized), OpenGLRenderer, unseen=()))
+  rows.append(drawn(env, state, OpenGLRenderer, unseen=looks.PARTS))
+  with BulletWorlds(env, latency_s=0.03, admittance=False) as worlds:
     state, act = env.reset(jnp.asarray(ROWS)), jax.jit(env.expert_action)
     for _ in range(PERIODS):
       state = env.observe(worlds.advance(state, act(state), np.ones(WORLDS, bool)))
-  rows += [drawn(env, state, Tiny, unseen=unseen) for unseen in ((), looks.PARTS)]
+  rows += [
+    drawn(env, state, TinyRenderer, unseen=unseen) for unseen in ((), looks.PARTS)
+  ]
   return rows
 
 
@@ -69,7 +71,11 @@ def played(env: Env) -> EnvState:
 
 
 def drawn(
-  env: Env, state: EnvState, renderer: type[OpenGL | Tiny], *, unseen: Collection[str]
+  env: Env,
+  state: EnvState,
+  renderer: type[OpenGLRenderer | TinyRenderer],
+  *,
+  unseen: Collection[str],
 ) -> np.ndarray:
   """Returns a row of tiles by a renderer."""
   with renderer(env.task.scene, env.config, unseen=unseen) as opened:

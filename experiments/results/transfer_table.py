@@ -5,11 +5,11 @@
       bullet/tiny/plain/60/admittance
   python experiments/results/transfer_table.py expert:stack_box
 
-A cell is physics/renderer/looks and, with Bullet, the latency in ms and "admittance".
-Looks such as unseen-shadows are unseen ones without a part. `apnpql transfer` plays
-every cell of every run in a process of its own, and the result is stored as
-<folder>/<run>-<cell>.json. The same command again plays only what is missing. It
-refuses a stored result of another seed, checkpoint, scene or setting. Then it writes
+A cell names a condition: physics/renderer/looks and, with Bullet, the latency in ms and
+"admittance". Looks such as unseen-shadows are unseen ones without a part. `apnpql
+transfer` plays every cell of every run in a process of its own, and the result is
+stored as <folder>/<run>-<cell>.json. The same command again plays only what is missing.
+It refuses a stored result of another seed, checkpoint, scene or setting. Then it writes
 two tables of all results in the folder: table.md has a row per result, and
 by_training.md a row per cell, with the seeds of each training together. Runs are
 distinguished by the names of their folders, which end with a hyphen and the seed.
@@ -30,8 +30,8 @@ from apnpql_jax.atomic import replacing
 from apnpql_jax.cli.inputs import task_env
 from apnpql_jax.errors import ConfigError, FileError, UserError
 from apnpql_jax.runs import checkpoint_reader, run_folder
-from apnpql_jax.transfer import conditions
-from apnpql_jax.transfer.cell import Cell
+from apnpql_jax.transfer import identity
+from apnpql_jax.transfer.condition import Condition
 
 OUT = Path(__file__).resolve().parent / "transfer"
 
@@ -54,11 +54,11 @@ EXPERT_CELLS = ["native/rays/plain", "bullet/rays/plain"]
 """Cells of the expert, which sees no images."""
 
 
-def cell_of(text: str) -> Cell:
-  """Returns the cell that a text such as bullet/tiny/unseen/60/admittance describes.
+def condition_of(text: str) -> Condition:
+  """Returns the condition of a cell such as bullet/tiny/unseen/60/admittance.
 
   Raises:
-    ConfigError: There is no such cell, or a package is missing.
+    ConfigError: There is no such condition, or a package is missing.
   """
   names, more = text.split("/")[:3], text.split("/")[3:]
   admittance = more[-1:] == [ADMITTANCE]
@@ -68,17 +68,18 @@ def cell_of(text: str) -> Cell:
     raise ConfigError(f"cell {text!r} must have the form {shape}")
   latency_ms = int(latency[0]) if latency else None
   looks, *without = names[2].split("-")
-  cell = Cell(*names[:2], looks, tuple(without), latency_ms, admittance)
-  cell.check()
-  return cell
+  condition = Condition(*names[:2], looks, tuple(without), latency_ms, admittance)
+  condition.check()
+  return condition
 
 
-def name_of(cell: Cell) -> str:
-  """Returns the part of a file's name that stands for a cell."""
-  about = cell.about()
-  parts = [cell.physics, cell.renderer, cell.looks, *about.get("without", ())]
+def name_of(condition: Condition) -> str:
+  """Returns the part of a file's name that stands for a condition."""
+  about = condition.about()
+  parts = [about[name] for name in ("physics", "renderer", "looks")]
+  parts += about.get("without", ())
   if "latency_ms" in about:
-    parts += [str(about["latency_ms"]), *[ADMITTANCE] * cell.admittance]
+    parts += [str(about["latency_ms"]), *[ADMITTANCE] * condition.admittance]
   return "-".join(parts)
 
 
@@ -87,47 +88,48 @@ def label_of(run: str) -> str:
   return "expert" if run.startswith(EXPERT) else Path(run).absolute().name
 
 
-def path_of(out: Path, run: str, cell: Cell) -> Path:
+def path_of(out: Path, run: str, condition: Condition) -> Path:
   """Returns the file of a result."""
   name = run.replace(":", "-") if run.startswith(EXPERT) else label_of(run)
-  return out / f"{name}-{name_of(cell)}.json"
+  return out / f"{name}-{name_of(condition)}.json"
 
 
-def options_of(run: str, cell: Cell) -> list[str]:
+def options_of(run: str, condition: Condition) -> list[str]:
   """Returns the arguments of `apnpql transfer`."""
   options = [run]
   if run.startswith(EXPERT):
     options = ["expert", "--task", run.removeprefix(EXPERT)]
-  about = cell.about()
+  about = condition.about()
   for name in ("physics", "renderer", "looks", "latency_ms"):
     if name in about:
       options += [f"--{name.replace('_', '-')}", str(about[name])]
-  if cell.without:
-    options += ["--without", *cell.without]
-  return [*options, *["--admittance"] * cell.admittance]
+  if condition.without:
+    options += ["--without", *condition.without]
+  return [*options, *["--admittance"] * condition.admittance]
 
 
-def conditions_of(run: str, cell: Cell, episodes: int, seed: int) -> dict[str, Any]:
-  """Returns what the result of a cell must hold.
+def identity_of(
+  run: str, condition: Condition, episodes: int, seed: int
+) -> dict[str, Any]:
+  """Returns the identity that the result of a cell must have.
 
   Raises:
     UserError: There is no such task or run, or it has no checkpoint.
   """
   if run.startswith(EXPERT):
     config = task_env(run.removeprefix(EXPERT))
-    return conditions.of_expert(config, cell, episodes=episodes, seed=seed)
+    return identity.of_expert(config, condition, episodes=episodes, seed=seed)
   folder = run_folder.open_run(Path(run))
   step = checkpoint_reader.restore(folder.path, None, {}, config=folder.config).step
-  return conditions.of_run(
-    folder.path, folder.config, step, cell, acting=None, episodes=episodes, seed=seed
-  )
+  options: dict[str, Any] = {"acting": None, "episodes": episodes, "seed": seed}
+  return identity.of_run(folder.path, folder.config, step, condition, **options)
 
 
 def check(path: Path, wanted: dict[str, Any]) -> None:
-  """Checks that a stored result was played under the wanted conditions.
+  """Checks that a stored result has the wanted identity.
 
   Raises:
-    FileError: It was not, or it is damaged.
+    FileError: It has another one, or it is damaged.
   """
   found = read(path)
   differing = [
@@ -141,21 +143,22 @@ def check(path: Path, wanted: dict[str, Any]) -> None:
 
 
 def play(
-  path: Path, run: str, cell: Cell, wanted: dict[str, Any], *, video: bool
+  path: Path, run: str, condition: Condition, wanted: dict[str, Any], *, video: bool
 ) -> None:
-  """Plays a cell and stores its result.
+  """Plays episodes under a condition and stores the result.
 
   Args:
     path: The file of the result.
     run: A run folder, or expert:TASK.
-    cell: The cell.
-    wanted: The conditions.
+    condition: The condition.
+    wanted: The identity of the result.
     video: Whether to film the first success and the first failure, next to ``path``.
 
   Raises:
     SystemExit: The command failed; it has printed why.
   """
-  command = [sys.executable, "-m", "apnpql_jax", "transfer", *options_of(run, cell)]
+  command = [sys.executable, "-m", "apnpql_jax", "transfer"]
+  command += options_of(run, condition)
   command += ["--episodes", str(wanted["episodes"]), "--seed", str(wanted["seed"])]
   path.parent.mkdir(parents=True, exist_ok=True)
   if video:
@@ -182,13 +185,13 @@ def main() -> None:
   args = parser.parse_args()
   try:
     cells = {
-      path_of(args.out, run, cell): (run, cell)
+      path_of(args.out, run, condition): (run, condition)
       for run in args.runs
-      for cell in map(cell_of, args.cells or cells_of(run))
+      for condition in map(condition_of, args.cells or cells_of(run))
     }
     # First: a cell takes minutes.
     wanted = {
-      path: conditions_of(*chosen, args.episodes, args.seed)
+      path: identity_of(*chosen, args.episodes, args.seed)
       for path, chosen in cells.items()
     }
     for path in filter(Path.exists, wanted):

@@ -14,8 +14,14 @@ import pytest
 
 from apnpql_jax import testing
 from apnpql_jax.reports import reading
-from apnpql_jax.sweeps import manifest as states
-from apnpql_jax.sweeps.manifest import Manifest
+from apnpql_jax.sweeps.manifest import (
+  DONE,
+  FAILED,
+  STOPPED,
+  WAITING,
+  Manifest,
+  load_manifest,
+)
 
 TRAIN = [*testing.TINY_ARGS, "--total-steps", "32"]
 
@@ -36,7 +42,7 @@ def sweep(folder: Path, *args: str) -> tuple[int, str, Manifest]:
   """Runs ``apnpql sweep`` and returns its exit code, messages and manifest."""
   process = start(folder, *args)
   _, messages = process.communicate()
-  return process.returncode, messages, states.load(folder)
+  return process.returncode, messages, load_manifest(folder)
 
 
 @pytest.mark.parametrize(
@@ -51,7 +57,7 @@ def test_one_failure_costs_the_others_nothing_and_is_retried(launcher, tmp_path)
   code, messages, found = sweep(folder, *line)
   assert code == 3 and "1 of 2 runs did not finish" in messages, messages
   bad, good = found.runs
-  assert (bad.state, bad.code, good.state) == (states.FAILED, 2, states.DONE)
+  assert (bad.state, bad.code, good.state) == (FAILED, 2, DONE)
   assert "unknown agent.algorithm 'nope'" in bad.line and bad.line in messages
   assert reading.read(found.run_dir(good)).finished
   assert "0 of 4" in (folder / f"{good.name}.log").read_text()
@@ -71,7 +77,7 @@ def test_ctrl_c_saves_the_runs_and_a_resume_continues(tmp_path):
   process.send_signal(signal.SIGINT)
   _, messages = process.communicate()
   assert process.returncode == 130, messages
-  first, second = states.load(folder).runs
+  first, second = load_manifest(folder).runs
   assert (first.state, first.code, second.state) == ("stopped", 143, "waiting")
   assert "saved at step" in first.line
   assert "apnpql sweep --resume runs/push_plate-sweep-1" in messages
@@ -83,12 +89,12 @@ def test_ctrl_c_saves_the_runs_and_a_resume_continues(tmp_path):
   data = json.loads(config.read_text()) | {"total_steps": done + testing.STEPS}
   config.write_text(json.dumps(data))
   process = start(folder.parent, "--resume", str(folder))
-  while states.load(folder).runs[0].state != states.DONE:
+  while load_manifest(folder).runs[0].state != DONE:
     assert process.poll() is None, process.communicate()
     time.sleep(0.1)
   process.send_signal(signal.SIGTERM)
   _, messages = process.communicate()
   assert process.returncode == 143 and f"done {name}" in messages, messages
-  first, second = states.load(folder).runs
-  assert first.attempts == 2 and second.state in (states.STOPPED, states.WAITING)
+  first, second = load_manifest(folder).runs
+  assert first.attempts == 2 and second.state in (STOPPED, WAITING)
   assert not (folder.parent / "push_plate-sweep-2").exists()

@@ -14,7 +14,7 @@ from apnpql_jax.config.files import load_preset
 from apnpql_jax.envs.env import make_env
 from apnpql_jax.envs.state import EnvState
 from apnpql_jax.robot import policy_folder
-from apnpql_jax.transfer.play import play
+from apnpql_jax.transfer.host_rollout import play
 from apnpql_jax.types import Array, Observation
 
 FOLDER = Path(__file__).parents[2] / "experiments/results/sim_to_real/policy"

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import pytest
 import transfer_results
 import transfer_table
-from transfer_table import cell_of
+from transfer_table import condition_of
 
 from apnpql_jax import testing
 from apnpql_jax.cli import transfer as command
@@ -35,8 +35,8 @@ FIGURES = {
 
 def store(out: Path, who: str, cell: str, **changes: Any) -> Path:
   """Stores a result as the script does, with some changes."""
-  chosen = cell_of(cell)
-  wanted = transfer_table.conditions_of(who, chosen, episodes=200, seed=0)
+  chosen = condition_of(cell)
+  wanted = transfer_table.identity_of(who, chosen, episodes=200, seed=0)
   label = transfer_table.label_of(who)
   path = transfer_table.path_of(out, who, chosen)
   path.write_text(json.dumps({"run": label} | wanted | FIGURES | changes))
@@ -60,16 +60,20 @@ def trained(tmp_path: Path) -> Path:
 
 def test_cells_are_options_of_the_command():
   pytest.importorskip("pybullet")
-  cell = cell_of("bullet/tiny/unseen/60/admittance")
-  args = parse(command.Transfer, "transfer", transfer_table.options_of("a/b", cell))
+  condition = condition_of("bullet/tiny/unseen/60/admittance")
+  args = parse(
+    command.Transfer, "transfer", transfer_table.options_of("a/b", condition)
+  )
   assert (args.physics, args.renderer, args.looks) == ("bullet", "tiny", "unseen")
   assert (args.run, args.latency_ms, args.admittance) == ("a/b", 60, True)
-  cell = cell_of("native/opengl/unseen-shadows-lights")
-  args = parse(command.Transfer, "transfer", transfer_table.options_of("a/b", cell))
+  condition = condition_of("native/opengl/unseen-shadows-lights")
+  args = parse(
+    command.Transfer, "transfer", transfer_table.options_of("a/b", condition)
+  )
   assert (args.looks, args.without) == ("unseen", ("shadows", "lights"))
-  assert transfer_table.name_of(cell) == "native-opengl-unseen-lights-shadows"
-  cell = cell_of("native/rays/plain")
-  words = transfer_table.options_of("expert:stack_box", cell)
+  assert transfer_table.name_of(condition) == "native-opengl-unseen-lights-shadows"
+  condition = condition_of("native/rays/plain")
+  words = transfer_table.options_of("expert:stack_box", condition)
   args = parse(command.Transfer, "transfer", words)
   assert (args.run, args.task, args.latency_ms) == ("expert", "stack_box", None)
   assert not args.admittance
@@ -79,7 +83,7 @@ def test_a_cell_has_one_name():
   """30 ms is the latency where none is named."""
   pytest.importorskip("pybullet")
   names = [
-    transfer_table.name_of(cell_of(f"bullet/rays/plain{more}"))
+    transfer_table.name_of(condition_of(f"bullet/rays/plain{more}"))
     for more in ("", "/30", "/admittance", "/30/admittance", "/60")
   ]
   assert names[0] == names[1] == "bullet-rays-plain-30"
@@ -100,13 +104,13 @@ def test_a_cell_has_one_name():
 )
 def test_other_cells_are_refused(text, words):
   with pytest.raises(ConfigError, match=words):
-    cell_of(text)
+    condition_of(text)
 
 
 def test_default_cells_are_valid():
   pytest.importorskip("pybullet")
   for cells in (transfer_table.CELLS, transfer_table.EXPERT_CELLS):
-    names = {transfer_table.name_of(cell_of(cell)) for cell in cells}
+    names = {transfer_table.name_of(condition_of(cell)) for cell in cells}
     assert len(names) == len(cells)
 
 

@@ -94,7 +94,7 @@ def test_damaged_folders_are_refused(copied, tmp_path):
 def test_the_example_of_a_cell_is_valid(tmp_path):
   path = tmp_path / "robot.toml"
   path.write_text(cell.EXAMPLE)
-  found = cell.load(path)
+  found = cell.load_cell(path)
   assert found.arm_host == "192.168.0.10"
   assert found.calibration == tmp_path / "calibration.json"
   assert found.cameras == {"global": "123456789012", "wrist": "210987654321"}
@@ -108,7 +108,7 @@ def test_a_cell_may_slow_the_arm(tmp_path):
   path = tmp_path / "robot.toml"
   path.write_text(cell.EXAMPLE + "[limits]\njoint_velocity_rad_per_s = 0.3\n")
   contract = {"joints": {"ranges": [[-7, 7]] * 7}, "control_period_s": 0.15}
-  limiter = MotionLimiter(cell.load(path).limits(contract), lambda joints: CENTER)
+  limiter = MotionLimiter(cell.load_cell(path).limits(contract), lambda joints: CENTER)
   limiter.start(np.zeros(6))
   for _ in range(1000):
     limiter.step(np.ones(6), limiter.position)
@@ -160,7 +160,7 @@ def test_bad_cells_name_the_key_and_the_cure(tmp_path, old, new, message):
   assert old in cell.EXAMPLE
   path.write_text(cell.EXAMPLE.replace(old, new))
   with pytest.raises(ConfigError, match=message) as error:
-    cell.load(path)
+    cell.load_cell(path)
   assert "\n" not in str(error.value)
 
 

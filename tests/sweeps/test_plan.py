@@ -18,9 +18,17 @@ from apnpql_jax.cli.sweep import (
 )
 from apnpql_jax.errors import ConfigError, FileError
 from apnpql_jax.runs import run_folder
-from apnpql_jax.sweeps import manifest as states
 from apnpql_jax.sweeps.launcher import Launch
-from apnpql_jax.sweeps.manifest import Manifest, find_equal, load, open_folder
+from apnpql_jax.sweeps.manifest import (
+  DONE,
+  FAILED,
+  MANIFEST_FILE,
+  Entry,
+  Manifest,
+  find_equal,
+  load_manifest,
+  open_folder,
+)
 from apnpql_jax.sweeps.plan import make_plan
 
 
@@ -140,10 +148,10 @@ def stored(folder: Path) -> Manifest:
 
 def test_a_manifest_is_read_as_it_was_written(tmp_path):
   made = stored(tmp_path / "sweep")
-  made.runs[1].state, made.runs[1].line = states.FAILED, "apnpql: no"
+  made.runs[1].state, made.runs[1].line = FAILED, "apnpql: no"
   made.launch = SLURM
   made.save()
-  assert load(tmp_path / "sweep") == made
+  assert load_manifest(tmp_path / "sweep") == made
   assert [(x.name, x.argv) for x in made.runs] == PLAN
 
 
@@ -173,24 +181,24 @@ def test_a_sweep_of_a_cluster_is_not_resumed_on_this_machine(tmp_path, monkeypat
   made.save()
   with pytest.raises(ConfigError, match="--launcher slurm needs"):
     sweep(parse_sweep(["--resume", str(made.folder)]))
-  assert load(made.folder) == made
+  assert load_manifest(made.folder) == made
 
 
 def test_earlier_manifests_are_of_this_machine(tmp_path):
   stored(tmp_path)
-  path = tmp_path / states.MANIFEST_FILE
+  path = tmp_path / MANIFEST_FILE
   data = json.loads(path.read_text())
   del data["launch"]
   path.write_text(json.dumps(data))
-  assert load(tmp_path).launch == Launch()
+  assert load_manifest(tmp_path).launch == Launch()
 
 
 def test_what_is_done_is_read_from_the_run_folders(tmp_path):
-  sweep = Manifest(tmp_path, [states.Entry(f"run-{i}", []) for i in range(3)])
+  sweep = Manifest(tmp_path, [Entry(f"run-{i}", []) for i in range(3)])
   make_run(tmp_path / "run-0", [0.5])
   make_run(tmp_path / "run-1", [0.5], finished=False)
-  sweep.runs[1].state = states.DONE  # Its folder was replaced.
-  sweep.runs[2].state = states.FAILED
+  sweep.runs[1].state = DONE  # Its folder was replaced.
+  sweep.runs[2].state = FAILED
   sweep.refresh()
   assert [entry.state for entry in sweep.runs] == ["done", "waiting", "waiting"]
   begun, new = (sweep.work(entry).command() for entry in sweep.runs[1:])
@@ -201,7 +209,7 @@ def test_what_is_done_is_read_from_the_run_folders(tmp_path):
 def test_the_same_plan_finds_its_sweep_and_a_larger_one_can_be_added(tmp_path):
   stored(tmp_path / "sweep")
   (tmp_path / "other").mkdir()
-  (tmp_path / "other" / states.MANIFEST_FILE).write_text("{")
+  (tmp_path / "other" / MANIFEST_FILE).write_text("{")
   assert find_equal(tmp_path, PLAN) == tmp_path / "sweep"
   more = make_plan(["push_plate"], ["agent.epsilon=0.5,1"], seeds=2)
   assert find_equal(tmp_path, more) is None
@@ -225,7 +233,7 @@ def test_a_preset_that_has_changed_is_noticed(tmp_path):
       f"CONFIG = dataclasses.replace(load_preset('push_plate'), {change})\n"
     )
     (run,) = make_plan([str(preset)], [])
-    return Manifest(tmp_path, [states.Entry("run", run.argv)])
+    return Manifest(tmp_path, [Entry("run", run.argv)])
 
   begun = planned("a.py", "total_steps=1000")
   check_begun(begun)  # Nothing has begun.
@@ -263,9 +271,9 @@ def test_a_folder_with_other_files_is_refused(tmp_path):
 )
 def test_a_foreign_manifest_is_refused_in_one_line(change, tmp_path: Path):
   stored(tmp_path)
-  path = tmp_path / states.MANIFEST_FILE
+  path = tmp_path / MANIFEST_FILE
   data = json.loads(path.read_text())
   change(data)
   path.write_text(json.dumps(data))
   with pytest.raises(FileError, match="sweep.json cannot be read"):
-    load(tmp_path)
+    load_manifest(tmp_path)

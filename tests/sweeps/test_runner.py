@@ -20,12 +20,21 @@ from run_files import make_run
 
 from apnpql_jax.errors import FileError
 from apnpql_jax.runs import run_folder
-from apnpql_jax.sweeps import manifest as states
 from apnpql_jax.sweeps.display import SweepDisplay
 from apnpql_jax.sweeps.following import Follower, last_line
 from apnpql_jax.sweeps.launcher import Job, Launcher, Work
 from apnpql_jax.sweeps.local import LocalLauncher, available_cores, shares
-from apnpql_jax.sweeps.manifest import Entry, Manifest
+from apnpql_jax.sweeps.manifest import (
+  DONE,
+  FAILED,
+  MANIFEST_FILE,
+  RUNNING,
+  STOPPED,
+  WAITING,
+  Entry,
+  Manifest,
+  load_manifest,
+)
 from apnpql_jax.sweeps.runner import Runner
 from apnpql_jax.sweeps.slurm import SlurmLauncher
 
@@ -66,7 +75,7 @@ def run(
   started = []
 
   def report(entry: Entry) -> None:
-    if entry.state == states.RUNNING:
+    if entry.state == RUNNING:
       started.append(entry.name)
 
   caught = [] if caught is None else caught
@@ -85,14 +94,14 @@ def test_a_failed_run_costs_the_others_nothing_and_is_retried(tmp_path):
   sweep = sweep_of(tmp_path, once, "", "import os; os.kill(os.getpid(), 9)")
   assert run(sweep) == ["a", "b", "c"]
   assert [entry.state for entry in sweep.runs] == ["failed", "done", "failed"]
-  first, _, third = states.load(tmp_path).runs
+  first, _, third = load_manifest(tmp_path).runs
   assert (first.code, first.line) == (1, "apnpql: no luck")
   assert third.code == -9 and "killed by signal 9" in third.line
   make_run(tmp_path / "b", [0.5])  # What a training would have left.
   assert run(sweep) == ["a", "c"]
-  first, second, _ = states.load(tmp_path).runs
-  assert (first.state, first.attempts, first.line) == (states.DONE, 2, "")
-  assert (second.state, second.attempts) == (states.DONE, 1)
+  first, second, _ = load_manifest(tmp_path).runs
+  assert (first.state, first.attempts, first.line) == (DONE, 2, "")
+  assert (second.state, second.attempts) == (DONE, 1)
 
 
 def test_what_another_process_has_saved_meanwhile_is_kept(tmp_path):
@@ -103,7 +112,7 @@ def test_what_another_process_has_saved_meanwhile_is_kept(tmp_path):
   meanwhile.runs[0].attempts, meanwhile.runs[0].job = 3, "17"
   meanwhile.save()
   run(sweep)
-  (entry,) = states.load(tmp_path).runs
+  (entry,) = load_manifest(tmp_path).runs
   assert entry.attempts == 4 and (tmp_path / "started").exists()
 
 
@@ -166,7 +175,7 @@ def test_runs_that_share_a_gpu_do_not_reserve_more_than_its_memory(
   assert found == [["0", "0.450"], ["0", "0.450"], ["1", "0.450"], ["1", "0.450"]]
 
 
-WAITING = """
+WAITING_SCRIPT = """
     import signal, sys, time
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(print("saved") or 143))
     print("ready", flush=True)
@@ -176,7 +185,7 @@ WAITING = """
 
 
 def test_a_signal_reaches_the_runs_and_starts_no_more(tmp_path):
-  sweep = sweep_of(tmp_path, *3 * [WAITING])
+  sweep = sweep_of(tmp_path, *3 * [WAITING_SCRIPT])
   caught: list[int] = []
 
   def interrupt() -> None:
@@ -224,14 +233,14 @@ def test_a_job_whose_time_is_over_saves_and_is_queued_again(tmp_path, monkeypatc
   threading.Thread(target=over).start()
   Runner(sweep, launcher, lambda _: None).run([], lambda: None)
   assert log.read_text() == 4 * "ready\n" + "resumed\n"
-  (entry,) = states.load(tmp_path).runs
-  assert (entry.state, entry.attempts, entry.code) == (states.DONE, 1, 0)
+  (entry,) = load_manifest(tmp_path).runs
+  assert (entry.state, entry.attempts, entry.code) == (DONE, 1, 0)
 
 
 def test_a_signal_reaches_jobs_too(tmp_path, monkeypatch):
   pytest.importorskip("submitit")
   monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
-  sweep = sweep_of(tmp_path, WAITING)
+  sweep = sweep_of(tmp_path, WAITING_SCRIPT)
   launcher = SlurmLauncher(tmp_path / "submitit", cluster="local")
   caught: list[int] = []
   log = tmp_path / "a.log"
@@ -270,17 +279,17 @@ def test_jobs_of_an_earlier_process_are_taken_over_and_take_their_room(tmp_path)
   sweep.save()
   runner = Runner(sweep, Finding(1, found), lambda x: events.append((x.name, x.state)))
   runner.run([], lambda: None)
-  assert events[:2] == [("a", states.RUNNING), ("b", states.RUNNING)]
-  assert sorted(events[2:4]) == [("a", states.DONE), ("b", states.DONE)]
-  each = [(name, state) for name in "cd" for state in (states.RUNNING, states.DONE)]
+  assert events[:2] == [("a", RUNNING), ("b", RUNNING)]
+  assert sorted(events[2:4]) == [("a", DONE), ("b", DONE)]
+  each = [(name, state) for name in "cd" for state in (RUNNING, DONE)]
   assert events[4:] == each
-  assert [(x.attempts, x.job) for x in states.load(tmp_path).runs] == 4 * [(1, "")]
+  assert [(x.attempts, x.job) for x in load_manifest(tmp_path).runs] == 4 * [(1, "")]
 
 
 def test_a_closed_terminal_leaves_jobs_running(tmp_path, monkeypatch):
   pytest.importorskip("submitit")
   monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
-  sweep = sweep_of(tmp_path, WAITING, "")
+  sweep = sweep_of(tmp_path, WAITING_SCRIPT, "")
   launcher = SlurmLauncher(tmp_path / "submitit", cluster="local", jobs=1)
   caught: list[int] = []
   log = tmp_path / "a.log"
@@ -290,8 +299,8 @@ def test_a_closed_terminal_leaves_jobs_running(tmp_path, monkeypatch):
       caught.append(signal.SIGHUP)
 
   Runner(sweep, launcher, lambda _: None).run(caught, show)
-  first, second = states.load(tmp_path).runs
-  assert (first.state, second.state) == (states.RUNNING, states.WAITING)
+  first, second = load_manifest(tmp_path).runs
+  assert (first.state, second.state) == (RUNNING, WAITING)
   os.kill(int(first.job), signal.SIGTERM)  # It still runs.
   while "saved" not in log.read_text():
     time.sleep(0.05)
@@ -329,8 +338,8 @@ def test_a_job_that_is_canceled_in_the_queue_has_been_stopped(tmp_path, monkeypa
   Runner(sweep, SlurmLauncher(tmp_path / "submitit"), lambda _: None).run(
     caught := [], lambda: caught.append(signal.SIGINT)
   )
-  (entry,) = states.load(tmp_path).runs
-  assert (entry.state, entry.code) == (states.STOPPED, 143)
+  (entry,) = load_manifest(tmp_path).runs
+  assert (entry.state, entry.code) == (STOPPED, 143)
   assert "job 17" in entry.line
 
 
@@ -338,14 +347,14 @@ def test_a_run_that_is_stopped_as_it_starts_has_not_failed(tmp_path):
   sweep = sweep_of(tmp_path, "import time; time.sleep(60)")
   caught: list[int] = []
   run(sweep, caught=caught, show=lambda: caught.append(signal.SIGINT))
-  assert (sweep.runs[0].state, sweep.runs[0].code) == (states.STOPPED, -signal.SIGTERM)
+  assert (sweep.runs[0].state, sweep.runs[0].code) == (STOPPED, -signal.SIGTERM)
 
 
 def test_two_processes_cannot_run_one_sweep(tmp_path):
   sweep = sweep_of(tmp_path, "")
   with run_folder.lock(tmp_path), pytest.raises(FileError, match="another process"):
     run(sweep)
-  assert not (tmp_path / states.MANIFEST_FILE).exists()
+  assert not (tmp_path / MANIFEST_FILE).exists()
 
 
 def test_progress_is_read_while_it_is_written(tmp_path):
@@ -370,8 +379,8 @@ def test_progress_is_read_while_it_is_written(tmp_path):
 def display_of(folder: Path, stream: io.StringIO) -> SweepDisplay:
   make_run(folder / "b", [0.25, 0.5], finished=False)
   sweep = sweep_of(folder, "", "", "")
-  sweep.runs[1].state = states.RUNNING
-  sweep.runs[2].state, sweep.runs[2].line = states.FAILED, "apnpql: disk full"
+  sweep.runs[1].state = RUNNING
+  sweep.runs[2].state, sweep.runs[2].line = FAILED, "apnpql: disk full"
   ticks = iter(range(0, 10_000, 100))
   return SweepDisplay(sweep, stream=stream, clock=lambda: next(ticks))
 

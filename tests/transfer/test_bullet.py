@@ -22,9 +22,9 @@ from apnpql_jax.sim.scene import Scene, load_scene
 from apnpql_jax.tasks import make_task, task_names
 from apnpql_jax.tasks.pinch import finger_angle, pinch_height
 from apnpql_jax.tasks.stack_box import SIDE
-from apnpql_jax.transfer import bullet, contacts
-from apnpql_jax.transfer.cell import Cell
-from apnpql_jax.transfer.plant import Plant, with_fields
+from apnpql_jax.transfer import bullet, friction
+from apnpql_jax.transfer.bullet_plant import BulletPlant, with_fields
+from apnpql_jax.transfer.condition import Condition
 from apnpql_jax.transfer.urdf import write
 
 PERIOD_S = 0.15
@@ -37,9 +37,9 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def plant(scene: Scene) -> Iterator[Plant]:
+def plant(scene: Scene) -> Iterator[BulletPlant]:
   pytest.importorskip("pybullet")
-  with Plant(scene, latency_s=0.0, admittance=False) as plant:
+  with BulletPlant(scene, latency_s=0.0, admittance=False) as plant:
     yield plant
 
 
@@ -76,13 +76,15 @@ def test_a_scene_that_bullet_lacks_is_refused(things, words, tmp_path):
   scene = load_scene(path)
   refusal = f"kitchen.xml has {words}, which --physics bullet lacks"
   with pytest.raises(ConfigError, match=f"^{refusal}$"):
-    Plant(scene, latency_s=0.0, admittance=False)
+    BulletPlant(scene, latency_s=0.0, admittance=False)
   env: Any = SimpleNamespace(task=SimpleNamespace(scene=scene))
   with pytest.raises(ConfigError, match=f"^{refusal}$"):
-    Cell(physics="bullet").make_worlds(env)
+    Condition(physics="bullet").make_worlds(env)
 
 
-def begin(plant: Plant, *, closed: bool = False, **fields: np.ndarray) -> np.ndarray:
+def begin(
+  plant: BulletPlant, *, closed: bool = False, **fields: np.ndarray
+) -> np.ndarray:
   """Starts from the keyframe; returns its qpos."""
   model = plant.scene.model
   qpos, data = plant.scene.keyframe("neutral"), mujoco.MjData(model)
@@ -174,7 +176,7 @@ def test_latency_shifts_the_motion(latency_s, scene, plant):
   begin(plant)
   path = follow(plant)
   shift = round(latency_s / TIMESTEP)
-  with Plant(scene, latency_s=latency_s, admittance=False) as late:
+  with BulletPlant(scene, latency_s=latency_s, admittance=False) as late:
     begin(late)
     found = follow(late)
   np.testing.assert_allclose(found[shift:], path[:-shift], atol=1e-3)
@@ -185,14 +187,14 @@ def test_latency_shifts_the_motion(latency_s, scene, plant):
 def test_latency_limits_the_speed(latency_s, expected, scene):
   """The virtual arm waits for the measured one, which is late (0.05 rad at most)."""
   fast = np.array([0, 0, 0, 0, 0, 1.0])
-  with Plant(scene, latency_s=latency_s, admittance=False) as late:
+  with BulletPlant(scene, latency_s=latency_s, admittance=False) as late:
     begin(late)
     for _ in range(14):
       late.step(fast, 0.0, PERIOD_S)
     assert late.bodies.state()[1][5] == pytest.approx(expected, abs=0.02)
 
 
-def follow(plant: Plant) -> np.ndarray:
+def follow(plant: BulletPlant) -> np.ndarray:
   """Returns joint angles f64[time, 6] at every cycle of two periods."""
   path = []
   for _ in range(round(2 * PERIOD_S / TIMESTEP)):
@@ -240,7 +242,7 @@ def between_pads(data: mujoco.MjData) -> np.ndarray:
   return tool.xpos - float(pinch_height(SIDE)) * tool.xmat.reshape(3, 3)[:, 2]
 
 
-def begin_with_box(plant: Plant) -> mujoco.MjData:
+def begin_with_box(plant: BulletPlant) -> mujoco.MjData:
   """Starts with the yellow box between the pads; returns that state in MuJoCo."""
   qpos = begin(plant)
   data = mujoco.MjData(plant.scene.model)
@@ -291,7 +293,7 @@ def test_admittance_yields_to_the_table(scene):
   pytest.importorskip("pybullet")
   down, forces = np.array([0, 0.25, 0, -0.25, 0, 0]), {}
   for admittance in (False, True):
-    with Plant(scene, latency_s=0.0, admittance=admittance) as plant:
+    with BulletPlant(scene, latency_s=0.0, admittance=admittance) as plant:
       begin(plant, closed=True)
       for _ in range(17):
         plant.step(down, 1.0, PERIOD_S)
@@ -314,14 +316,14 @@ def test_nothing_pushes_a_hand_in_the_air(plant):
 
 def test_frictions_of_the_pairs_become_factors():
   model = make_task("push_plate").scene.model
-  factors = contacts.sliding(model)
+  factors = friction.sliding(model)
   plate, tip = model.body("plate").id, model.body("r2").id
   assert factors[0] * factors[plate] == pytest.approx(0.2)
   assert factors[tip] * factors[plate] == pytest.approx(0.3)
-  assert contacts.spinning(model) == {}
+  assert friction.spinning(model) == {}
   model = make_task("place_plate").scene.model
   tip = model.body("r2").id
-  assert contacts.spinning(model)[tip] == pytest.approx(0.01)
+  assert friction.spinning(model)[tip] == pytest.approx(0.01)
 
 
 def test_worlds_have_fields_of_their_own(scene):
@@ -356,30 +358,30 @@ def test_a_randomized_world_stands_in_bullet_as_in_mujoco(plant):
 
 
 @pytest.mark.parametrize(
-  ("cell", "words"),
+  ("condition", "words"),
   [
-    (Cell(latency_ms=30), "--latency-ms needs --physics bullet"),
-    (Cell(admittance=True), "--admittance needs --physics bullet"),
-    (Cell("bullet", latency_ms=31), "--latency-ms 31 must be one of 0, 30, 60"),
+    (Condition(latency_ms=30), "--latency-ms needs --physics bullet"),
+    (Condition(admittance=True), "--admittance needs --physics bullet"),
+    (Condition("bullet", latency_ms=31), "--latency-ms 31 must be one of 0, 30, 60"),
   ],
 )
-def test_options_of_bullet_are_checked(cell, words):
+def test_options_of_bullet_are_checked(condition, words):
   with pytest.raises(ConfigError, match=words):
-    cell.check()
+    condition.check()
 
 
 @pytest.mark.parametrize(
-  ("cell", "option"),
+  ("condition", "option"),
   [
-    (Cell("bullet"), "--physics bullet"),
-    (Cell(renderer="tiny"), "--renderer tiny"),
+    (Condition("bullet"), "--physics bullet"),
+    (Condition(renderer="tiny"), "--renderer tiny"),
   ],
 )
-def test_a_missing_package_is_named(cell, option, monkeypatch):
+def test_a_missing_package_is_named(condition, option, monkeypatch):
   monkeypatch.setitem(sys.modules, "pybullet", None)
   cure = f"{option} needs PyBullet: pip install 'apnpql-jax\\[transfer\\]'"
   with pytest.raises(ConfigError, match=cure):
-    cell.check()
+    condition.check()
 
 
 def test_links_have_the_colors_of_materials_and_textures(tmp_path):

@@ -33,13 +33,13 @@ from apnpql_jax.training import evaluate
 from apnpql_jax.training.rollout import expert_policy, make_player
 from apnpql_jax.training.train import train
 from apnpql_jax.training.video import HOLD
-from apnpql_jax.transfer import film, looks, tiny
-from apnpql_jax.transfer.cell import Cell
-from apnpql_jax.transfer.opengl import OpenGL
-from apnpql_jax.transfer.play import Played, play
-from apnpql_jax.transfer.tiny import Tiny
-from apnpql_jax.transfer.transfer import make_draw, transfer, transfer_expert
-from apnpql_jax.transfer.worlds import Worlds
+from apnpql_jax.transfer import looks, outcome_video, tiny_renderer
+from apnpql_jax.transfer.bullet_worlds import BulletWorlds
+from apnpql_jax.transfer.condition import Condition
+from apnpql_jax.transfer.evaluation import evaluate_expert, evaluate_run, make_draw
+from apnpql_jax.transfer.host_rollout import EpisodeBatch, play
+from apnpql_jax.transfer.opengl_renderer import OpenGLRenderer
+from apnpql_jax.transfer.tiny_renderer import TinyRenderer
 
 CONFIG = dataclasses.replace(testing.TINY.env, task="push_plate")
 
@@ -54,12 +54,12 @@ def env() -> Env:
 
 
 @pytest.fixture(scope="module")
-def plain(env: Env) -> Iterator[OpenGL]:
-  yield from opened(env.task.scene, OpenGL, unseen=())
+def plain(env: Env) -> Iterator[OpenGLRenderer]:
+  yield from opened(env.task.scene, OpenGLRenderer, unseen=())
 
 
 def opened(scene: Scene, renderer: type, *, unseen: Collection[str]) -> Iterator[Any]:
-  if renderer is Tiny:
+  if renderer is TinyRenderer:
     pytest.importorskip("pybullet")
   try:
     gl = renderer(scene, CONFIG, unseen=unseen)
@@ -80,7 +80,9 @@ def state(env: Env) -> EnvState:
   return env.reset(jnp.asarray(ROWS))
 
 
-def images(gl: OpenGL, env: Env, state: EnvState, time: int = 0) -> list[np.ndarray]:
+def images(
+  gl: OpenGLRenderer, env: Env, state: EnvState, time: int = 0
+) -> list[np.ndarray]:
   """Returns the images of the worlds."""
   views = make_draw(env, gl)(state.physics, ROWS, np.ones(len(ROWS), bool), time)
   return [np.asarray(view) for view in views]
@@ -103,7 +105,7 @@ def test_bullet_moves_the_worlds_that_still_run(env):
   pytest.importorskip("pybullet")
   state, act = env.reset(jnp.asarray(ROWS)), jax.jit(env.expert_action)
   running = np.array([True, True, False])
-  with Worlds(env, latency_s=0.0, admittance=False) as worlds:
+  with BulletWorlds(env, latency_s=0.0, admittance=False) as worlds:
     for _ in range(3):
       before = state.physics
       state = env.observe(worlds.advance(state, act(state), running))
@@ -121,7 +123,7 @@ def test_bullet_moves_the_worlds_that_still_run(env):
 def test_a_world_that_bullet_breaks_counts_as_a_fault(env, monkeypatch):
   pytest.importorskip("pybullet")
   state = env.reset(jnp.asarray(ROWS))
-  with Worlds(env, latency_s=0.0, admittance=False) as worlds:
+  with BulletWorlds(env, latency_s=0.0, admittance=False) as worlds:
     worlds.advance(state, jnp.zeros((3, 7)), np.ones(3, bool))
     nothing = (
       np.full(env.task.scene.model.nq, np.nan),
@@ -136,15 +138,15 @@ def test_a_world_that_bullet_breaks_counts_as_a_fault(env, monkeypatch):
 def test_video_shows_the_first_success_and_the_first_failure():
   nothing: Any = None
   batches = [
-    Played(np.array(solved), nothing, [], nothing, nothing, nothing)
+    EpisodeBatch(np.array(solved), nothing, [], nothing, nothing, nothing)
     for solved in ([True, True], [False, True])
   ]
-  assert film.first(batches, success=True) == 0
-  assert film.first(batches, success=False) == 2
-  assert film.first(batches[:1], success=False) is None
+  assert outcome_video.first(batches, success=True) == 0
+  assert outcome_video.first(batches, success=False) == 2
+  assert outcome_video.first(batches[:1], success=False) is None
 
 
-@pytest.mark.parametrize("renderer", [OpenGL, Tiny])
+@pytest.mark.parametrize("renderer", [OpenGLRenderer, TinyRenderer])
 @pytest.mark.parametrize("randomize", [False, True])
 def test_others_see_what_the_ray_caster_sees(randomize, renderer, env, state):
   scene, physics = env.task.scene, state.physics
@@ -167,7 +169,7 @@ def test_others_see_what_the_ray_caster_sees(randomize, renderer, env, state):
     assert expected.std() > 10
 
 
-@pytest.mark.parametrize("renderer", [OpenGL, Tiny])
+@pytest.mark.parametrize("renderer", [OpenGLRenderer, TinyRenderer])
 def test_background_has_the_color_of_the_ray_caster(renderer):
   """The wrist camera of this task sees beyond the table."""
   scene = make_task("flip_cup").scene
@@ -183,7 +185,7 @@ def test_background_has_the_color_of_the_ray_caster(renderer):
     assert sky.mean() > 0.02 and sky[0].any()
 
 
-@pytest.mark.parametrize("renderer", [OpenGL, Tiny])
+@pytest.mark.parametrize("renderer", [OpenGLRenderer, TinyRenderer])
 def test_materials_and_textures_have_the_color_of_the_ray_caster(renderer, tmp_path):
   """With and without colors of the world in place of the model's."""
   scene = load_scene(painted(tmp_path))
@@ -208,7 +210,7 @@ def test_materials_and_textures_have_the_color_of_the_ray_caster(renderer, tmp_p
         np.testing.assert_allclose(hue, color / color.mean(), atol=0.15)
 
 
-@pytest.mark.parametrize("renderer", [OpenGL, Tiny])
+@pytest.mark.parametrize("renderer", [OpenGLRenderer, TinyRenderer])
 def test_unseen_looks_follow_from_version_and_row(renderer, env, state):
   (first, again, later), (known,) = (
     [images(drawing, env, state, time=time) for time in times]
@@ -223,8 +225,8 @@ def test_unseen_looks_follow_from_version_and_row(renderer, env, state):
 
 
 def test_tiny_keeps_few_worlds_loaded(env, state, monkeypatch):
-  monkeypatch.setattr(tiny, "KEPT", 2)
-  for strange in opened(env.task.scene, Tiny, unseen=looks.PARTS):
+  monkeypatch.setattr(tiny_renderer, "KEPT", 2)
+  for strange in opened(env.task.scene, TinyRenderer, unseen=looks.PARTS):
     for view, other in zip(
       images(strange, env, state), images(strange, env, state), strict=True
     ):
@@ -255,7 +257,7 @@ def weighted(tree: Any) -> float:
   return float(values @ np.linspace(1.0, 2.0, len(values)))
 
 
-@pytest.mark.parametrize("renderer", [OpenGL, Tiny])
+@pytest.mark.parametrize("renderer", [OpenGLRenderer, TinyRenderer])
 def test_each_part_of_unseen_looks_changes_the_images(renderer, env, state):
   found = []
   chosen = [set(looks.PARTS) - {part} for part in looks.PARTS]
@@ -268,7 +270,7 @@ def test_each_part_of_unseen_looks_changes_the_images(renderer, env, state):
 @pytest.mark.parametrize("part", looks.PARTS)
 def test_a_part_of_unseen_looks_is_one_change_of_plain_ones(part, plain, env, state):
   known, everywhere = images(plain, env, state), ("surfaces", "lights", "camera")
-  for drawing in opened(env.task.scene, OpenGL, unseen=[part]):
+  for drawing in opened(env.task.scene, OpenGLRenderer, unseen=[part]):
     difference = np.abs(images(drawing, env, state)[0].astype(int) - known[0])
     changed = (difference > 4).any(-1).mean()
     assert changed > 0.5 if part in everywhere else 0.005 < changed < 0.5
@@ -308,7 +310,7 @@ def test_area_resize_averages_blocks():
 def test_expert_is_measured_with_its_interval(monkeypatch):
   """In two batches of two, of which the last episode does not count."""
   monkeypatch.setattr(evaluate, "MAX_WORLDS", 2)
-  found = transfer_expert(CONFIG, Cell(looks="plain"), episodes=3)
+  found = evaluate_expert(CONFIG, Condition(looks="plain"), episodes=3)
   assert found["episodes"] == 3 and found["sufficient"] == (found["successes"] == 3)
   low, high = found["ci95"]
   assert low <= found["success_rate"] <= high
@@ -318,22 +320,25 @@ def test_expert_is_measured_with_its_interval(monkeypatch):
 
 
 @pytest.mark.parametrize(
-  ("cell", "words"),
+  ("condition", "words"),
   [
-    (Cell(physics="bullet-proof"), "'bullet-proof'; choose from mjx, native"),
-    (Cell(renderer="paint"), "'paint'; choose from rays, opengl"),
-    (Cell(looks="new"), "'new'; choose from trained, plain, unseen"),
-    (Cell(looks="unseen"), "unseen needs --renderer opengl"),
-    (Cell(renderer="opengl", without=("clutter",)), "--without needs --looks unseen"),
+    (Condition(physics="bullet-proof"), "'bullet-proof'; choose from mjx, native"),
+    (Condition(renderer="paint"), "'paint'; choose from rays, opengl"),
+    (Condition(looks="new"), "'new'; choose from trained, plain, unseen"),
+    (Condition(looks="unseen"), "unseen needs --renderer opengl"),
     (
-      Cell(renderer="opengl", looks="unseen", without=("dust",)),
+      Condition(renderer="opengl", without=("clutter",)),
+      "--without needs --looks unseen",
+    ),
+    (
+      Condition(renderer="opengl", looks="unseen", without=("dust",)),
       "'dust'; choose from surfaces, lights, shadows",
     ),
   ],
 )
-def test_unknown_cells_are_refused(cell, words):
+def test_unknown_conditions_are_refused(condition, words):
   with pytest.raises(ConfigError, match=words):
-    transfer_expert(EnvConfig(), cell)
+    evaluate_expert(EnvConfig(), condition)
 
 
 @pytest.mark.slow
@@ -345,9 +350,12 @@ def test_a_policy_from_pixels_plays_in_opengl(instants, tmp_path: Path, plain):
     testing.TINY, env=env, agent=agent, total_steps=testing.STEPS
   )
   train(config, tmp_path / "run")
-  for cell in (Cell(looks="plain"), Cell(renderer="opengl", looks="unseen")):
-    video = tmp_path / f"{cell.renderer}.mp4"
-    found = transfer(tmp_path / "run", cell, episodes=4, video=video)
+  for condition in (
+    Condition(looks="plain"),
+    Condition(renderer="opengl", looks="unseen"),
+  ):
+    video = tmp_path / f"{condition.renderer}.mp4"
+    found = evaluate_run(tmp_path / "run", condition, episodes=4, video=video)
     assert found["video"] == str(video)
     assert set(found["video_episodes"].values()) != {None}
     assert iio.imread(video).shape[0] <= 2 * (4 + HOLD)

@@ -42,34 +42,34 @@ def test_frames_show_the_images_of_both_cameras_and_the_scene(player):
 def test_the_action_moves_the_world_and_is_explained(player):
   """The next frame is where ``Env.step`` leads from the explained action."""
   frame = player.begin()
-  before, thought = player._state, frame.explanation
-  np.testing.assert_array_equal(frame.action, thought.action)
-  assert any((thought.candidates == frame.action).all(-1))
-  assert len(thought.weights) == testing.TINY.agent.policy_samples
-  np.testing.assert_array_equal(frame.shares, thought.prior.shares)
+  before, explanation = player._state, frame.explanation
+  np.testing.assert_array_equal(frame.action, explanation.action)
+  assert any((explanation.candidates == frame.action).all(-1))
+  assert len(explanation.weights) == testing.TINY.agent.policy_samples
+  np.testing.assert_array_equal(frame.shares, explanation.prior.shares)
   action = jnp.asarray(frame.action)[None]
   after = player.actor.env.step(before, action, jax.random.key(9))
   expected = player.actor.env.poses(after.physics).geom_xpos[0]
   np.testing.assert_allclose(player.step().poses.geom_xpos, expected, atol=1e-5)
 
 
-def test_hands_lead_from_the_tool_to_where_the_primitive_ends(player):
+def test_tool_paths_lead_to_where_the_primitive_ends(player):
   frame, scene = player.begin(), player.actor.env.task.scene
   tool = frame.poses.site_xpos[scene.tool_site]
   chain = arm.make_chain(scene)
   q = player._state.physics.qpos[0, scene.arm_qpos]
-  for hand, velocity in zip(
-    frame.hands, frame.explanation.primitives[:, :6], strict=True
+  for path, velocity in zip(
+    frame.tool_paths, frame.explanation.primitives[:, :6], strict=True
   ):
-    np.testing.assert_allclose(hand.path[0], tool, atol=1e-4)
+    np.testing.assert_allclose(path.positions[0], tool, atol=1e-4)
     # Close by, the tool moves as the Jacobian maps the velocity.
     _, _, jacobian = arm.forward(chain, q)
     ahead = np.asarray(jacobian[:3] @ velocity.clip(-1, 1))
-    first = hand.path[1] - hand.path[0]
+    first = path.positions[1] - path.positions[0]
     cosine = first @ ahead / np.linalg.norm(first) / np.linalg.norm(ahead)
     assert cosine > 0.98
-    np.testing.assert_allclose(hand.mat @ hand.mat.T, np.eye(3), atol=1e-4)
-    assert 0.0 <= hand.close <= 1.0
+    np.testing.assert_allclose(path.mat @ path.mat.T, np.eye(3), atol=1e-4)
+    assert 0.0 <= path.close <= 1.0
 
 
 def test_equal_seeds_give_equal_episodes(player):

@@ -1,4 +1,4 @@
-"""Parameters of MuJoCo's contact pairs as those that PyBullet gives to each link.
+"""Friction of MuJoCo's contact pairs, converted to one factor per link for PyBullet.
 
 MuJoCo has a friction per pair of geoms, Bullet one per link: the friction of a contact
 is the product of two factors. Bullet's contacts are rigid; a time constant and an

@@ -1,8 +1,7 @@
-"""Held-out episodes of a policy or of the expert in worlds that training did not have.
+"""Evaluation of a policy or the expert in worlds that differ from those of training.
 
-A cell is a choice of physics, renderer and looks. The expert acts on privileged poses,
-so its success depends on the physics alone. Where the expert fails, a cell is no
-evidence about a policy.
+The expert acts on privileged poses, so its success depends on the physics alone. Where
+it fails, the condition is no evidence about a policy.
 """
 
 from __future__ import annotations
@@ -36,21 +35,20 @@ from apnpql_jax.training.evaluate import (
   held_out_batches,
   load_agent,
 )
-from apnpql_jax.transfer import film
-from apnpql_jax.transfer.cell import Cell, Renderer
-from apnpql_jax.transfer.conditions import of_expert, of_run
-from apnpql_jax.transfer.play import Act, Draw, Played, play
+from apnpql_jax.transfer import identity, outcome_video
+from apnpql_jax.transfer.condition import Condition, Renderer
+from apnpql_jax.transfer.host_rollout import Act, Draw, EpisodeBatch, play
 from apnpql_jax.types import Array
 
 EXPERT_SUFFICES = 0.95
-"""Success rate of the expert above which a cell is evidence about a policy."""
+"""Success rate of the expert from which on a condition is evidence about a policy."""
 
 _POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat")
 
 
-def transfer(
+def evaluate_run(
   run_dir: Path | str,
-  cell: Cell,
+  condition: Condition,
   *,
   episodes: int = 200,
   seed: int = 0,
@@ -58,11 +56,11 @@ def transfer(
   acting: str | None = None,
   video: Path | str | None = None,
 ) -> dict[str, Any]:
-  """Plays held-out episodes of a cell with a checkpoint of a run.
+  """Plays held-out episodes under a condition with a checkpoint of a run.
 
   Args:
     run_dir: The run folder.
-    cell: The worlds.
+    condition: What the worlds consist of.
     episodes: Number of episodes.
     seed: Random seed of the episodes and of the policy.
     step: Step of the checkpoint; the newest if None.
@@ -71,17 +69,17 @@ def transfer(
     video: File for a video of the first success and the first failure.
 
   Returns:
-    The conditions, see ``conditions.of_run``; the success rate with its Wilson
-    interval; the mean length in control periods; failures by their last stage, as in
-    ``diagnose``; the rows of the reset bank that failed, which have the same worlds in
-    all cells; and the time that it took, s.
+    What identifies the result, see ``identity.of_run``; the success rate with its
+    Wilson interval; the mean length in control periods; failures by their last stage,
+    as in ``diagnose``; the rows of the reset bank from which episodes failed, which
+    are the same worlds under all conditions; and the time that it took, s.
 
   Raises:
     ConfigError: An argument is invalid, or a package or library is missing.
     FileError: Not a run folder, or no readable checkpoint.
   """
   began, video = time.monotonic(), None if video is None else check_video(video)
-  cell.check()
+  condition.check()
   check_count(episodes, seed)
   if acting is not None:
     check_name("acting", acting, ACTING)
@@ -95,14 +93,16 @@ def transfer(
   # First, because a run that is training may remove the checkpoint meanwhile.
   task = make_task(config.env.task)
   agent, params, step = load_agent(run_dir, config, task, step=step)
-  conditions = of_run(
-    run_dir, config, step, cell, acting=acting, episodes=episodes, seed=seed
+  identified = identity.of_run(
+    run_dir, config, step, condition, acting=acting, episodes=episodes, seed=seed
   )
   lstm_instants = config.agent.lstm_instants
-  outside = cell.renderer != "rays"
+  outside = condition.renderer != "rays"
   obs = "state" if outside else "pixels"  # Others draw the images.
-  env = _make_env(config.env, cell, obs, lstm_instants=0 if outside else lstm_instants)
-  rule = conditions["acting"]
+  env = _make_env(
+    config.env, condition, obs, lstm_instants=0 if outside else lstm_instants
+  )
+  rule = identified["acting"]
   choose = jax.jit(lambda p, seen, key: agent.act(p, seen, key, acting=rule)[0])
 
   def act(state: EnvState, seen: Any, key: Array) -> Array:
@@ -110,44 +110,45 @@ def transfer(
     return choose(params, seen, key)
 
   with contextlib.ExitStack() as stack:
-    draw = _draw_of(env, cell, stack)
+    draw = _draw_of(env, condition, stack)
     lstm_instants = lstm_instants if draw else 0
     played = _play_all(
-      env, cell, act, episodes, seed, draw=draw, lstm_instants=lstm_instants
+      env, condition, act, episodes, seed, draw=draw, lstm_instants=lstm_instants
     )
     filmed = _filmed(env, played, video, draw)
-  return _summary(conditions, played, began) | filmed
+  return _summary(identified, played, began) | filmed
 
 
-def transfer_expert(
+def evaluate_expert(
   env_config: EnvConfig,
-  cell: Cell,
+  condition: Condition,
   *,
   episodes: int = 200,
   seed: int = 0,
   video: Path | str | None = None,
 ) -> dict[str, Any]:
-  """Plays held-out episodes of a cell with the scripted expert; see ``transfer``.
+  """Plays held-out episodes under a condition with the scripted expert.
 
-  The expert sees no images; a video shows those of the cell. ``sufficient`` is whether
-  it reaches ``EXPERT_SUFFICES``.
+  The arguments are those of ``evaluate_run``. The expert sees no images; a video shows
+  those of the condition. ``sufficient`` in the result is whether the expert reaches
+  ``EXPERT_SUFFICES``.
   """
   began, video = time.monotonic(), None if video is None else check_video(video)
-  cell.check()
+  condition.check()
   check_count(episodes, seed)
-  env = _make_env(env_config, cell, "state", lstm_instants=0)
+  env = _make_env(env_config, condition, "state", lstm_instants=0)
   choose = jax.jit(env.expert_action)
 
   def act(state: EnvState, seen: Any, key: Array) -> Array:
     del seen, key
     return choose(state)
 
-  played = _play_all(env, cell, act, episodes, seed)
+  played = _play_all(env, condition, act, episodes, seed)
   with contextlib.ExitStack() as stack:
-    draw = _draw_of(env, cell, stack) if video else None
+    draw = _draw_of(env, condition, stack) if video else None
     filmed = _filmed(env, played, video, draw)
-  conditions = of_expert(env_config, cell, episodes=episodes, seed=seed)
-  found = _summary(conditions, played, began)
+  identified = identity.of_expert(env_config, condition, episodes=episodes, seed=seed)
+  found = _summary(identified, played, began)
   return found | filmed | {"sufficient": found["success_rate"] >= EXPERT_SUFFICES}
 
 
@@ -180,40 +181,44 @@ def make_draw(env: Env, renderer: Renderer) -> Draw:
   return draw
 
 
-def _draw_of(env: Env, cell: Cell, stack: contextlib.ExitStack) -> Draw | None:
-  """Returns what draws the images; None if the environment does itself."""
-  outside = cell.make_renderer(env)
+def _draw_of(
+  env: Env, condition: Condition, stack: contextlib.ExitStack
+) -> Draw | None:
+  """Returns what draws the images; None if the environment draws them itself."""
+  outside = condition.make_renderer(env)
   return make_draw(env, stack.enter_context(outside)) if outside else None
 
 
 def _filmed(
-  env: Env, played: list[Played], video: Path | None, draw: Draw | None
+  env: Env, played: list[EpisodeBatch], video: Path | None, draw: Draw | None
 ) -> dict[str, Any]:
-  """Writes the video, if asked for; returns its part of the result."""
+  """Writes the video if asked for; returns its items of the result."""
   if video is None:
     return {}
   found: dict[str, Any] = {"video": None}
   with reporting(f"write {video}"):  # The episodes took minutes; keep their figures.
-    found = film.record(env, played, video, draw=draw)
+    found = outcome_video.record(env, played, video, draw=draw)
   return found
 
 
-def _make_env(config: EnvConfig, cell: Cell, obs: str, *, lstm_instants: int) -> Env:
+def _make_env(
+  config: EnvConfig, condition: Condition, obs: str, *, lstm_instants: int
+) -> Env:
   devices.start()
   # With Bullet, the environment only starts and observes the worlds.
-  backend = "native" if cell.physics == "bullet" else cell.physics
+  backend = "native" if condition.physics == "bullet" else condition.physics
   config = dataclasses.replace(
-    config, backend=backend, randomize=cell.looks == "trained", obs=obs
+    config, backend=backend, randomize=condition.looks == "trained", obs=obs
   )
   return make_env(config, lstm_instants=lstm_instants)
 
 
 def _play_all(
-  env: Env, cell: Cell, act: Act, episodes: int, seed: int, **options: Any
-) -> list[Played]:
+  env: Env, condition: Condition, act: Act, episodes: int, seed: int, **options: Any
+) -> list[EpisodeBatch]:
   """Plays batches of episodes; the last one has no more than are asked for."""
   with contextlib.ExitStack() as stack:
-    if worlds := cell.make_worlds(env):
+    if worlds := condition.make_worlds(env):
       options["advance"] = stack.enter_context(worlds).advance
     played = [
       play(env, act, rows, key, **options)
@@ -224,16 +229,16 @@ def _play_all(
 
 
 def _summary(
-  conditions: dict[str, Any], played: list[Played], began: float
+  identified: dict[str, Any], played: list[EpisodeBatch], began: float
 ) -> dict[str, Any]:
-  """Returns the conditions with the figures; ``began`` is a monotonic time, s."""
+  """Returns the result; ``began`` is a monotonic time, s."""
   success = np.concatenate([x.success for x in played])
   stages = [stage for x in played for stage in x.stages]
   failures = Counter(
     end_of(stages[i]) for i in np.flatnonzero(~success) if len(stages[i])
   )
   return {
-    **conditions,
+    **identified,
     **success_figures(int(success.sum()), len(success)),
     "mean_length": float(np.concatenate([x.length for x in played]).mean()),
     "failures": dict(failures),

@@ -1,4 +1,4 @@
-"""Sessions: what their buttons do; and the server that shows them."""
+"""Playbacks: what their buttons do; and the server that shows them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import urllib.request
 
 import pytest
 
-from apnpql_jax.viewing.session import Session
+from apnpql_jax.viewing.playback import Playback
 
 
 class Log:
@@ -42,54 +42,54 @@ def wait_until(condition) -> None:
 
 
 @contextlib.contextmanager
-def running(session: Session, view) -> Generator[None]:
-  """Runs a session in a thread."""
-  thread = threading.Thread(target=session.run, args=(view,), daemon=True)
+def running(playback: Playback, view) -> Generator[None]:
+  """Runs a playback in a thread."""
+  thread = threading.Thread(target=playback.run, args=(view,), daemon=True)
   thread.start()
   try:
     yield
   finally:
-    session.close()
+    playback.close()
     thread.join(60)
     assert not thread.is_alive()
 
 
 def test_buttons_pause_step_and_begin(player):
-  session, log = Session(player), Log()
-  session.toggle()
-  with running(session, log):
+  playback, log = Playback(player), Log()
+  playback.toggle()
+  with running(playback, log):
     wait_until(lambda: not log.playing and log.frames)
     shown = len(log.frames)
     time.sleep(0.5)
     assert len(log.frames) == shown
     for _ in range(2):
-      session.step()
+      playback.step()
     wait_until(lambda: len(log.frames) == shown + 2)
     assert log.frames[-1].time_s - log.frames[-3].time_s == pytest.approx(0.3)
-    session.new_episode()
+    playback.new_episode()
     wait_until(lambda: len(log.frames) == shown + 3)
     assert log.frames[-1].time_s == 0.0
     assert log.frames[-1].episode == log.frames[-2].episode + 1
-    session.set_speed(100.0)
-    session.toggle()
+    playback.set_speed(100.0)
+    playback.toggle()
     wait_until(lambda: log.frames[-1].last and log.playing)
     wait_until(lambda: log.frames[-1].time_s == 0.0)  # The next one begins by itself.
 
 
 def test_checkpoints_are_offered_chosen_and_followed(player):
-  session, log = Session(player), Log()
-  session.toggle()
-  with running(session, log):
+  playback, log = Playback(player), Log()
+  playback.toggle()
+  with running(playback, log):
     wait_until(lambda: log.steps)
     assert log.steps == player.actor.steps()
-    session.choose(log.steps[-1])
+    playback.choose(log.steps[-1])
     wait_until(lambda: log.frames[-1].checkpoint == log.steps[-1])
-    session.new_episode()
-    session.choose(12345)
+    playback.new_episode()
+    playback.choose(12345)
     wait_until(lambda: log.lines)
     assert "no checkpoint 12345" in log.lines[0]
     assert log.frames[-1].checkpoint == log.steps[-1]
-    session.choose(None)
+    playback.choose(None)
     wait_until(lambda: log.frames[-1].checkpoint == log.steps[0])
 
 
@@ -100,13 +100,13 @@ def free_port() -> int:
 
 def test_the_server_shows_frames_to_this_machine_only(player):
   pytest.importorskip("viser")
-  from apnpql_jax.viewing import browser
+  from apnpql_jax.viewing import live_view
 
-  session = Session(player)
-  session.toggle()
-  view = browser.Browser(session, host="127.0.0.1", port=free_port())
+  playback = Playback(player)
+  playback.toggle()
+  view = live_view.LiveView(playback, host="127.0.0.1", port=free_port())
   try:
-    with running(session, view):
+    with running(playback, view):
       with urllib.request.urlopen(view.url) as answer:
         assert answer.status == 200 and b"<html" in answer.read().lower()
       own = socket.gethostbyname(socket.gethostname())
@@ -114,13 +114,13 @@ def test_the_server_shows_frames_to_this_machine_only(player):
         address = own, int(view.url.rsplit(":", 1)[1])
         with pytest.raises(OSError):
           socket.create_connection(address, timeout=5)
-      wait_until(lambda: not session.playing and session.frames)
-      click(view.buttons, browser.STEP)
-      wait_until(lambda: len(session.frames) == 2)
-      later = f"episode {session.frames[0].episode}, {0.15:.1f} s"
+      wait_until(lambda: not playback.playing and playback.frames)
+      click(view.buttons, live_view.STEP)
+      wait_until(lambda: len(playback.frames) == 2)
+      later = f"episode {playback.frames[0].episode}, {0.15:.1f} s"
       wait_until(lambda: later in view.headline.content)
-      click(view.buttons, browser.EPISODE)
-      wait_until(lambda: len(session.frames) == 1)
+      click(view.buttons, live_view.EPISODE)
+      wait_until(lambda: len(playback.frames) == 1)
       wait_until(lambda: len(view.checkpoint.options) > 1)
       view.checkpoint.value = view.checkpoint.options[-1]
       wait_until(lambda: str(player.actor.step) == view.checkpoint.options[-1])
@@ -128,7 +128,7 @@ def test_the_server_shows_frames_to_this_machine_only(player):
       chosen = view.checkpoint.value
       view.offer(player.actor.steps()[:-1])
       assert view.checkpoint.value == chosen == view.checkpoint.options[-1]
-      view.checkpoint.value = browser.NEWEST
+      view.checkpoint.value = live_view.NEWEST
       wait_until(lambda: str(player.actor.step) == view.checkpoint.options[1])
   finally:
     view.close()
@@ -146,7 +146,7 @@ def click(group, option: str) -> None:
 def test_an_address_that_is_not_of_this_machine_is_an_error():
   pytest.importorskip("viser")
   from apnpql_jax.errors import ConfigError
-  from apnpql_jax.viewing.browser import check_server
+  from apnpql_jax.viewing.live_view import check_server
 
   with pytest.raises(ConfigError, match="--host 192.0.2.1 cannot be served"):
     check_server("192.0.2.1")

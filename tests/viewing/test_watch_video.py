@@ -1,4 +1,4 @@
-"""Films and boards: what their pixels show."""
+"""Videos and dashboards: what their pixels show."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import pytest
 from apnpql_jax import testing
 from apnpql_jax.cli import main
 from apnpql_jax.envs.cameras import in_hand
-from apnpql_jax.viewing import film, shapes
+from apnpql_jax.viewing import shapes, watch_video
 from apnpql_jax.viewing.actors import scripted
-from apnpql_jax.viewing.board import Board
+from apnpql_jax.viewing.dashboard import Dashboard
 from apnpql_jax.viewing.frame import COLORS
 from apnpql_jax.viewing.player import Player
 
@@ -32,31 +32,31 @@ def frames(player):
 
 
 def test_the_strips_grow_in_the_colors_of_the_weights(frames):
-  board = Board(epsilon=1.0, explained=True, scale=1)
-  early, late = board.draw(frames[:1]), board.draw(frames)
+  dashboard = Dashboard(epsilon=1.0, explained=True, scale=1)
+  early, late = dashboard.draw(frames[:1]), dashboard.draw(frames)
   assert early.dtype == np.uint8 and early.shape == late.shape
   # What is drawn depends on the frames alone, not on what was drawn before.
-  np.testing.assert_array_equal(board.draw(frames[:1]), early)
+  np.testing.assert_array_equal(dashboard.draw(frames[:1]), early)
   heaviest = COLORS[int(frames[-1].shares.argmax())]
   assert share_of(late, heaviest) > 2 * share_of(early, heaviest) > 0
 
 
-def test_a_film_shows_every_instant(player, tmp_path):
-  path, solved = film.film(player, tmp_path / "watch.mp4", episodes=2)
+def test_a_video_shows_every_instant(player, tmp_path):
+  path, solved = watch_video.record(player, tmp_path / "watch.mp4", episodes=2)
   images = iio.imread(path, plugin="pyav")
   episode = len(list(player.episode())) - 1 + 8  # The last instant is held.
-  assert images.shape == (2 * episode, *film.SIZE, 3) and 0 <= solved <= 2
+  assert images.shape == (2 * episode, *watch_video.SIZE, 3) and 0 <= solved <= 2
   assert (images[0] != images[episode]).any()
 
 
 def test_the_projection_is_that_of_the_image(frames, player):
   """Where the ghost of the hand is drawn at its present pose, the image shows it."""
   scene = player.actor.env.task.scene
-  painter = film.Painter(scene, title="", epsilon=None)
+  painter = watch_video.Painter(scene, title="", epsilon=None)
   for frame in frames:
     hand = frame.poses.geom_xpos[scene.id("geom", "hand")]
     image = frame.images["wide"]
-    spot = painter._project(hand[None], frame)[0] / film._VIEW[::-1]
+    spot = painter._project(hand[None], frame)[0] / watch_video._VIEW[::-1]
     column, row = (spot * image.shape[1::-1]).astype(int)
     assert image[row, column].max() < 80  # The hand is dark, the table is light.
     assert image[-1, 0].min() > 150
@@ -93,12 +93,12 @@ def test_meshes_have_the_volume_of_their_shape(kind):
   assert 0.93 * volume < found <= volume * (1 + 1e-6)
 
 
-def test_the_expert_has_a_film_without_explanations(tmp_path):
+def test_random_actions_have_a_video_without_explanations(tmp_path):
   player = Player(scripted("random", testing.TINY.env), wide=(24, 32))
   frames = [player.begin(), player.step()]
-  painter = film.Painter(player.actor.env.task.scene, title="x", epsilon=None)
+  painter = watch_video.Painter(player.actor.env.task.scene, title="x", epsilon=None)
   image = painter.paint(frames, 2)
-  assert image.shape == (*film.SIZE, 3)
+  assert image.shape == (*watch_video.SIZE, 3)
   assert share_of(image, COLORS[frames[1].stage]) > 0.003
 
 

@@ -1,4 +1,4 @@
-"""Video of a success and a failure of a cell."""
+"""Video of the first success and the first failure under a condition."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from apnpql_jax.training.video import (
   tile,
   write_video,
 )
-from apnpql_jax.transfer.play import Draw, Played
+from apnpql_jax.transfer.host_rollout import Draw, EpisodeBatch
 
 
 def record(
-  env: Env, played: Sequence[Played], path: Path, *, draw: Draw | None
+  env: Env, played: Sequence[EpisodeBatch], path: Path, *, draw: Draw | None
 ) -> dict[str, Any]:
   """Writes the first success and the first failure, one after the other.
 
-  The large view comes from the ray caster, the others from the cell's renderer.
+  The large view comes from the ray caster, the others from the condition's renderer.
 
   Args:
     env: The worlds.
     played: Episodes.
     path: The file; its folder is created.
-    draw: Draws the images of the cell; the ray caster if None.
+    draw: Draws the images of the condition; the ray caster if None.
 
   Returns:
     ``video``: the written path; ``video_episodes``: the numbers of the two episodes,
@@ -55,13 +55,13 @@ def record(
   return {"video": str(written), "video_episodes": numbers}
 
 
-def first(played: Sequence[Played], *, success: bool) -> int | None:
+def first(played: Sequence[EpisodeBatch], *, success: bool) -> int | None:
   """Returns the number of the first episode that succeeded or failed, if any."""
   found = np.flatnonzero(np.concatenate([x.success for x in played]) == success)
   return int(found[0]) if len(found) else None
 
 
-def _find(played: Sequence[Played], number: int) -> tuple[Played, int]:
+def _find(played: Sequence[EpisodeBatch], number: int) -> tuple[EpisodeBatch, int]:
   for batch in played:
     if number < len(batch.success):
       return batch, number
@@ -71,7 +71,7 @@ def _find(played: Sequence[Played], number: int) -> tuple[Played, int]:
 
 def _clip(
   env: Env,
-  batch: Played,
+  batch: EpisodeBatch,
   world: int,
   draw: Draw | None,
   color: tuple[int, int, int],

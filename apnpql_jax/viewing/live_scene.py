@@ -23,8 +23,8 @@ _PLANE = 3.0
 """Edge in m of the square that is drawn of a plane."""
 
 
-class Stage:
-  """The nodes of a scene in a server of viser, moved with every frame."""
+class LiveScene:
+  """Nodes of a scene in a viser server, moved with every frame."""
 
   def __init__(self, server: Any, scene: Scene):
     """Adds the light and the camera; the geoms follow with the first frame."""
@@ -51,12 +51,13 @@ class Stage:
     for node, i, turn in zip(self._geoms, ids, turns, strict=True):
       node.position, node.wxyz = frame.poses.geom_xpos[i], turn
     for k, (ghost, way, label) in enumerate(self._ghosts):
-      hand, share = frame.hands[k], float(frame.shares[k])
-      ghost.position, ghost.wxyz = hand.path[-1], _quaternions(hand.mat)
+      path, share = frame.tool_paths[k], float(frame.shares[k])
+      positions = path.positions
+      ghost.position, ghost.wxyz = positions[-1], _quaternions(path.mat)
       ghost.opacity = 0.12 + 0.5 * share
-      way.points = np.stack([hand.path[:-1], hand.path[1:]], axis=1)
+      way.points = np.stack([positions[:-1], positions[1:]], axis=1)
       way.thickness = 0.002 + 0.006 * share
-      label.position = hand.path[-1] + [0.0, 0.0, 0.03]
+      label.position = positions[-1] + [0.0, 0.0, 0.03]
       label.text = f"{PRIMITIVES[k]} {share:.0%}"
 
   def _appearance(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:

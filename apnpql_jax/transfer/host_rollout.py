@@ -1,4 +1,4 @@
-"""Episodes whose physics and images may come from outside of JAX.
+"""Rollouts on the host, whose physics and images may come from outside of JAX.
 
 The loop over time is in Python. With the engine and the cameras of the environment it
 plays the same episodes as ``training.rollout.make_player``.
@@ -36,8 +36,8 @@ Advance = Callable[[EnvState, Array, np.ndarray], Arrival]
 
 
 @dataclasses.dataclass(frozen=True)
-class Played:
-  """One episode per world."""
+class EpisodeBatch:
+  """A batch of episodes, one per world."""
 
   success: np.ndarray  # bool[worlds]
   length: np.ndarray  # i32[worlds], control periods
@@ -48,7 +48,7 @@ class Played:
   qpos: np.ndarray
   """Their configurations at every instant, f32[time, worlds, nq]."""
 
-  def without_last(self, count: int) -> Played:
+  def without_last(self, count: int) -> EpisodeBatch:
     """Returns all but the last ``count`` episodes; ``start`` and ``qpos`` are kept."""
     kept = len(self.success) - count
     names = "success", "length", "stages", "rows"
@@ -64,7 +64,7 @@ def play(
   draw: Draw | None = None,
   lstm_instants: int = 0,
   advance: Advance | None = None,
-) -> Played:
+) -> EpisodeBatch:
   """Plays one episode per row of the bank; a world that breaks counts as failed.
 
   Args:
@@ -105,12 +105,12 @@ def play(
       state = env.observe(advance(state, action, running))
   active = np.stack(stages)
   kept = [x[x >= 0] for x in active.T]
-  return Played(success, length, kept, np.asarray(rows), start, np.stack(qpos))
+  return EpisodeBatch(success, length, kept, np.asarray(rows), start, np.stack(qpos))
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _stage(env: Env, state: EnvState) -> Array:
-  """Returns ``expert_stage``, with one trace for all batches of an environment."""
+  """Returns ``expert_stage``, traced once for all batches of an environment."""
   return expert_stage(env, state)
 
 

@@ -35,8 +35,11 @@ _VARIED = ("geom_rgba", "geom_size", "geom_matid", "cam_fovy")
 """Fields of the model that differ between worlds or looks."""
 
 
-class OpenGL:
-  """Draws worlds one after the other; belongs to the thread that made it."""
+class OpenGLRenderer:
+  """MuJoCo's OpenGL renderer, which belongs to the thread that made it.
+
+  It draws worlds one after the other.
+  """
 
   def __init__(self, scene: Scene, config: EnvConfig, *, unseen: Collection[str]):
     """Compiles the scene again, with lights and textures.
@@ -71,7 +74,7 @@ class OpenGL:
     shadows = config.shadows or "shadows" in self._unseen
     self._view = View(model, height, width, shadows=shadows, reflections=False)
 
-  def __enter__(self) -> OpenGL:
+  def __enter__(self) -> OpenGLRenderer:
     return self
 
   def __exit__(self, *error: object) -> None:

@@ -1,4 +1,4 @@
-"""PyBullet as a plant: one world that is driven as a real arm is.
+"""The plant in PyBullet: one world that is driven as a real arm is.
 
 The virtual arm of the robot's runtime moves as in training, and Bullet's position
 servos follow it, as those of the real arm do. So neither the armature that Bullet lacks
@@ -22,7 +22,7 @@ from apnpql_jax.sim import motors
 from apnpql_jax.sim.names import FLANGE_SITE
 from apnpql_jax.sim.physics import OWN_FIELDS
 from apnpql_jax.sim.scene import Scene
-from apnpql_jax.transfer import bullet, contacts, urdf
+from apnpql_jax.transfer import bullet, friction, urdf
 
 SOLVER_ITERATIONS = 300
 """Iterations of Bullet's solver, which makes a step of 2 ms per command of the servos.
@@ -58,8 +58,8 @@ REFRESH_CYCLES = 75
 """Cycles after which Bullet finds the contacts of the hand again: 0.15 s."""
 
 
-class Plant:
-  """One world; ``begin`` starts an episode."""
+class BulletPlant:
+  """One world in PyBullet, in which ``begin`` starts an episode."""
 
   def __init__(self, scene: Scene, *, latency_s: float, admittance: bool):
     """Opens a simulator.
@@ -81,7 +81,7 @@ class Plant:
       ArmModel(), admittance=Admittance(lag=lag) if admittance else None
     )
 
-  def __enter__(self) -> Plant:
+  def __enter__(self) -> BulletPlant:
     return self
 
   def __exit__(self, *error: object) -> None:
@@ -220,7 +220,7 @@ class Plant:
 
   def _set_contacts(self, model: mujoco.MjModel) -> None:
     """Sets what decides on contacts, and the damping of joints."""
-    sliding, spinning = contacts.sliding(model), contacts.spinning(model)
+    sliding, spinning = friction.sliding(model), friction.spinning(model)
     for body, (loaded, link) in self.bodies.place.items():
       dof = model.body_dofadr[body]
       hinge = link >= 0 and dof >= 0

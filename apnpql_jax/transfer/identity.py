@@ -1,6 +1,6 @@
-"""Conditions of a result: what decides on the episodes of a cell.
+"""The identity of a result: everything that determines its episodes.
 
-Two results with equal conditions come from the same worlds and the same policy.
+Two results with the same identity come from the same worlds and the same policy.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ import zlib
 from apnpql_jax.config.schema import EnvConfig, TrainConfig
 from apnpql_jax.runs import checkpoint_record
 from apnpql_jax.tasks import make_task
-from apnpql_jax.transfer.cell import Cell
+from apnpql_jax.transfer.condition import Condition
 
 
 def of_expert(
-  config: EnvConfig, cell: Cell, *, episodes: int, seed: int
+  config: EnvConfig, condition: Condition, *, episodes: int, seed: int
 ) -> dict[str, Any]:
-  """Returns the conditions of episodes of the scripted expert."""
+  """Returns the identity of a result of the scripted expert."""
   return {
     **_of_worlds(config),
-    **cell.about(),
+    **condition.about(),
     "algorithm": "expert",
     "episodes": episodes,
     "seed": seed,
@@ -34,19 +34,19 @@ def of_run(
   run_dir: Path,
   config: TrainConfig,
   step: int,
-  cell: Cell,
+  condition: Condition,
   *,
   acting: str | None,
   episodes: int,
   seed: int,
 ) -> dict[str, Any]:
-  """Returns the conditions of episodes of a run's policy.
+  """Returns the identity of a result of a run's policy.
 
   Args:
     run_dir: The run folder.
     config: Its settings.
     step: The step of the checkpoint.
-    cell: The worlds.
+    condition: What the worlds consist of.
     acting: Rule that chooses actions; that of the run's evaluations if None.
     episodes: Number of episodes.
     seed: Random seed of the episodes and of the policy.
@@ -57,7 +57,7 @@ def of_run(
   learner = checkpoint_record.read(run_dir, step).items.get("learner", {})
   return {
     **_of_worlds(config.env),
-    **cell.about(),
+    **condition.about(),
     "algorithm": config.agent.algorithm,
     "trained": "randomized" if config.env.randomize else "plain",
     "checkpoint_step": step,
@@ -70,7 +70,7 @@ def of_run(
 
 def _of_worlds(config: EnvConfig) -> dict[str, Any]:
   """Returns task and scene, and a checksum of the settings of worlds and images."""
-  # A cell chooses the physics, and a task may be read from any folder.
+  # A condition chooses the physics, and a task may be read from any folder.
   fields = dataclasses.asdict(config)
   used = {k: x for k, x in fields.items() if k not in ("backend", "task_file")}
   return {

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from apnpql_jax.transfer import tiny
+from apnpql_jax.transfer import tiny_renderer
 
 
 @pytest.mark.parametrize("name", "SPHERE CAPSULE ELLIPSOID CYLINDER BOX".split())
@@ -19,8 +19,8 @@ def test_shapes_of_clutter_have_the_silhouettes_of_mujoco(name, tmp_path):
   )
   data = mujoco.MjData(model)
   mujoco.mj_forward(model, data)
-  geoms = tiny.Geoms.from_model(model)
-  world = tiny._World(model, geoms, model.geom_size, tmp_path)
+  geoms = tiny_renderer.Geoms.from_model(model)
+  world = tiny_renderer._World(model, geoms, model.geom_size, tmp_path)
   world.place(data.geom_xpos, data.geom_xmat)
   mat = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
   height, width, fovy = 80, 120, 30.0

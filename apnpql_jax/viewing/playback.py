@@ -1,4 +1,4 @@
-"""A session: plays an actor at some speed, as buttons ask, and shows the frames."""
+"""The playback of an actor: speed, pauses, steps and checkpoints as buttons ask."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HOLD_S = 1.5
 
 
 class View(Protocol):
-  """What shows a session."""
+  """Display of a playback."""
 
   def show(self, frames: Sequence[Frame]) -> None:
     """Shows the last frame; ``frames`` are those of its episode up to it."""
@@ -28,14 +28,14 @@ class View(Protocol):
     """Offers the checkpoints with these steps, newest first."""
 
   def state(self, *, playing: bool) -> None:
-    """Shows whether the session plays by itself."""
+    """Shows whether the playback runs or is paused."""
 
   def report(self, line: str) -> None:
-    """Shows an error of a request."""
+    """Shows the error that a request has caused."""
 
 
-class Session:
-  """Plays frames until it is closed; its requests can come from other threads."""
+class Playback:
+  """Playback of frames until ``close``; requests may come from other threads."""
 
   def __init__(self, player: Player, *, follow: bool = True):
     """Keeps the player; with ``follow``, episodes begin with the newest checkpoint."""

@@ -1,4 +1,4 @@
-"""MuJoCo's shapes as PyBullet draws them.
+"""Visual shapes of PyBullet for MuJoCo's geoms.
 
 PyBullet shades its own cylinders and capsules like other shapes: a flat disc looks like
 a cone. Everything round is therefore a mesh here.
@@ -12,11 +12,11 @@ import mujoco
 import numpy as np
 
 _TABLE = 4.0  # m, half the side of the square that stands for a plane
-_REPEAT = 1.5  # textures of the table per meter, about as in ``opengl``
+_REPEAT = 1.5  # textures of the table per meter, about as in ``opengl_renderer``
 _SIDES, _RINGS = 20, 5  # of round shapes, around and from the equator to a pole
 
 
-def shape(client: Any, kind: int, size: np.ndarray) -> dict[str, Any]:
+def visual_shape(client: Any, kind: int, size: np.ndarray) -> dict[str, Any]:
   """Returns the arguments of ``createVisualShape`` for a geom's type and size."""
   kinds, radius, half = mujoco.mjtGeom, float(size[0]), float(size[1])
   if kind == kinds.mjGEOM_BOX:

@@ -1,4 +1,4 @@
-"""The board of the live view: both cameras and the plots, in a narrow column."""
+"""The dashboard of the live view: both cameras and the plots, in a narrow column."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from matplotlib.axes import Axes
 import numpy as np
 
 from apnpql_jax.viewing.frame import Frame
+from apnpql_jax.viewing.panels import InstantPanel, StripsPanel, place_cameras
 from apnpql_jax.viewing.sheet import Sheet, draw_picture
-from apnpql_jax.viewing.thoughts import Instant, Strips, place_cameras
 
 WIDTH = 460
 _CAMERAS, _STRIPS, _INSTANT = 190, 470, 170
 """Heights in pixels."""
 
 
-class Board:
-  """Draws the frames of an episode in progress."""
+class Dashboard:
+  """Images of both cameras and plots, for an episode in progress."""
 
   def __init__(self, *, epsilon: float | None, explained: bool, scale: int = 2):
     """Prepares the sheet.
@@ -33,9 +33,9 @@ class Board:
     self._pictures: dict[str, Axes] = {}
     self._sheet = sheet = Sheet(WIDTH, _CAMERAS + strips + instant, scale=scale)
     box = (6, _CAMERAS, WIDTH - 14, strips)
-    self._strips = Strips(sheet, box, epsilon=epsilon)
+    self._strips = StripsPanel(sheet, box, epsilon=epsilon)
     place = (6, _CAMERAS + strips, WIDTH - 14, instant)
-    self._instant = Instant(sheet, place) if explained else None
+    self._instant = InstantPanel(sheet, place) if explained else None
 
   def draw(self, frames: Sequence[Frame]) -> np.ndarray:
     """Returns the image u8[H, W, 3] of the last of the frames of an episode so far."""

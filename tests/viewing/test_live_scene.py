@@ -15,7 +15,7 @@ from apnpql_jax.config.files import mjcf_path
 from apnpql_jax.render import Geoms
 from apnpql_jax.sim.scene import Scene, load_scene
 from apnpql_jax.viewing import shapes
-from apnpql_jax.viewing.frame import Frame, Hand
+from apnpql_jax.viewing.frame import Frame, ToolPath
 
 MESHES = {
   "wedge": 'vertex="0 0 0 0.3 0 0 0 0.2 0 0.3 0.2 0 0 0 0.1 0 0.2 0.2"',
@@ -66,15 +66,15 @@ def test_a_flat_mesh_is_a_thin_tile(scene):
 
 def test_the_live_view_shows_them(scene):
   viser = pytest.importorskip("viser")
-  from apnpql_jax.viewing.stage import Stage
+  from apnpql_jax.viewing.live_scene import LiveScene
 
   with socket.create_server(("127.0.0.1", 0)) as listener:
     port = listener.getsockname()[1]
   server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
   try:
-    stage = Stage(server, scene)
-    stage.show(frame_of(scene))
-    nodes = {node.name: node for node in stage._geoms}
+    live = LiveScene(server, scene)
+    live.show(frame_of(scene))
+    nodes = {node.name: node for node in live._geoms}
     for name, corners in hulls_of(scene).items():
       geom = scene.id("geom", name)
       drawn = nodes[f"/scene/{geom}"].vertices
@@ -98,7 +98,7 @@ def frame_of(scene: Scene) -> Frame:
     solved=False,
     last=False,
     action=np.zeros(7),
-    hands=(Hand(np.zeros((2, 3)), np.eye(3), 0.0),) * 3,
+    tool_paths=(ToolPath(np.zeros((2, 3)), np.eye(3), 0.0),) * 3,
     stage=0,
     explanation=None,
     images={},

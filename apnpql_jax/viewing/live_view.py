@@ -1,4 +1,4 @@
-"""The live view in a browser, by viser."""
+"""The live view: a page in the browser, served by viser."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from apnpql_jax.errors import ConfigError
-from apnpql_jax.viewing.board import Board
+from apnpql_jax.viewing.dashboard import Dashboard
 from apnpql_jax.viewing.frame import COLORS, Frame
-from apnpql_jax.viewing.session import Session
-from apnpql_jax.viewing.stage import Stage
+from apnpql_jax.viewing.live_scene import LiveScene
+from apnpql_jax.viewing.playback import Playback
 
 NEWEST = "newest"
 SPEEDS = {"¼×": 0.25, "½×": 0.5, "1×": 1.0, "2×": 2.0, "4×": 4.0}
@@ -26,10 +26,10 @@ _LINES = '<div style="padding:8px 12px 2px;font-size:14px;line-height:1.7">{}</d
 PLAY, PAUSE, STEP, EPISODE = "Play", "Pause", "Step", "New episode"
 
 
-class Browser:
-  """A web server that shows a session; a ``session.View``."""
+class LiveView:
+  """Web server that shows a playback in a browser; a ``playback.View``."""
 
-  def __init__(self, session: Session, *, host: str, port: int):
+  def __init__(self, playback: Playback, *, host: str, port: int):
     """Starts the server; if ``port`` is taken, uses the next free one.
 
     Raises:
@@ -39,10 +39,10 @@ class Browser:
 
     import viser
 
-    actor = session.player.actor
+    actor = playback.player.actor
     with contextlib.redirect_stdout(io.StringIO()):  # It prints the address in a box.
       server: Any = viser.ViserServer(host=host, port=port, verbose=False)
-    self._server, self._session = server, session
+    self._server, self._playback = server, playback
     self.url = f"http://{host}:{server.get_port()}"
     server.gui.configure_theme(
       control_width="large",
@@ -51,8 +51,8 @@ class Browser:
       brand_color=(28, 126, 214),
     )
     server.gui.main_panel.dock_right()
-    self._stage = Stage(server, actor.env.task.scene)
-    self._board: Board | None = None
+    self._scene = LiveScene(server, actor.env.task.scene)
+    self._dashboard: Dashboard | None = None
     self._add_controls()
 
   def close(self) -> None:
@@ -61,13 +61,13 @@ class Browser:
 
   def show(self, frames: Sequence[Frame]) -> None:
     """See ``View.show``."""
-    frame, actor = frames[-1], self._session.player.actor
-    if self._board is None:
+    frame, actor = frames[-1], self._playback.player.actor
+    if self._dashboard is None:
       explained = frame.explanation is not None
-      self._board = Board(epsilon=actor.epsilon, explained=explained)
-    image = self._board.draw(frames)
+      self._dashboard = Dashboard(epsilon=actor.epsilon, explained=explained)
+    image = self._dashboard.draw(frames)
     with self._server.atomic():
-      self._stage.show(frame)
+      self._scene.show(frame)
       self._plots.image = image
       self.headline.content = _headline(actor.title, frame)
 
@@ -88,22 +88,22 @@ class Browser:
       client.add_notification("Not possible", line, color="red")
 
   def _add_controls(self) -> None:
-    gui, session = self._server.gui, self._session
+    gui, playback = self._server.gui, self._playback
     self.headline = gui.add_html(_LINES.format("preparing the first episode …"))
     self.buttons = gui.add_button_group("", (PAUSE, STEP, EPISODE))
     self.speed = gui.add_button_group("speed", [*SPEEDS])
     self.checkpoint = gui.add_dropdown("checkpoint", (NEWEST,), visible=False)
     self._plots = gui.add_image(np.full((8, 8, 3), 255, np.uint8), format="png")
     requests: dict[str, Callable[[], None]] = {
-      PLAY: session.toggle,
-      PAUSE: session.toggle,
-      STEP: session.step,
-      EPISODE: session.new_episode,
+      PLAY: playback.toggle,
+      PAUSE: playback.toggle,
+      STEP: playback.step,
+      EPISODE: playback.new_episode,
     }
     # Handlers run in threads of the server, and only leave requests.
     self.buttons.on_click(lambda event: requests[event.target.value]())
-    self.speed.on_click(lambda event: session.set_speed(SPEEDS[event.target.value]))
-    self.checkpoint.on_update(lambda event: session.choose(_step(event.target.value)))
+    self.speed.on_click(lambda event: playback.set_speed(SPEEDS[event.target.value]))
+    self.checkpoint.on_update(lambda event: playback.choose(_step(event.target.value)))
 
 
 def _step(chosen: str) -> int | None:

@@ -1,4 +1,4 @@
-"""Films of watched episodes: the scene, both cameras, and what the agent considers."""
+"""Videos of watched episodes: the scene, both cameras, and the plots."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from apnpql_jax.sim.scene import Scene
 from apnpql_jax.training import video
 from apnpql_jax.viewing import strips
 from apnpql_jax.viewing.frame import COLORS, Frame
+from apnpql_jax.viewing.panels import InstantPanel, StripsPanel, place_cameras
 from apnpql_jax.viewing.player import Player
 from apnpql_jax.viewing.shapes import GhostHand
 from apnpql_jax.viewing.sheet import Sheet, draw_picture
-from apnpql_jax.viewing.thoughts import Instant, Strips, place_cameras
 
 SIZE = (720, 1280)
-"""Height and width of a film in pixels."""
+"""Height and width of a video in pixels."""
 
 WIDE = (738, 1080)
 """Height and width of the image of the camera ``wide``, for the closest view."""
 
 _VIEW = (492, 720)
-"""Height and width of the view of the scene in a film, of the whole image or a part."""
+"""Height and width at which the scene, or a part of it, is shown, in pixels."""
 
 _MARGIN = 55
 """Pixels around all that moves in the view."""
@@ -41,7 +41,7 @@ _TOP = 36
 
 
 class Painter:
-  """Paints the frames of an episode one by one."""
+  """Painter of the images of a video, one per frame of an episode."""
 
   def __init__(self, scene: Scene, *, title: str, epsilon: float | None):
     """Prepares the sheet; ``title`` names the actor, ``epsilon`` limits its KL."""
@@ -53,8 +53,8 @@ class Painter:
     left, top = _VIEW[1] + 24, _TOP + _VIEW[0] + 6
     box = (left, _TOP, width - left - 18, height - _TOP - 8)
     self._cameras = (12, top, 364, height - top - 12)
-    self._strips = Strips(sheet, box, epsilon=epsilon)
-    self._instant = Instant(sheet, (392, top, _VIEW[1] - 396, height - top - 4))
+    self._strips = StripsPanel(sheet, box, epsilon=epsilon)
+    self._instant = InstantPanel(sheet, (392, top, _VIEW[1] - 396, height - top - 4))
 
   def paint(self, frames: Sequence[Frame], count: int) -> np.ndarray:
     """Returns the image u8[*SIZE, 3] of frame ``count``, from 1, of an episode."""
@@ -83,11 +83,14 @@ class Painter:
     return self._sheet.image(key, prepare, draw)
 
   def _part(self, frames: Sequence[Frame]) -> dict[str, tuple[float, float]]:
-    """Returns limits of the view around the robot, the objects and the ways."""
+    """Returns limits of the view around the robot, the objects and the tool paths."""
     moving = np.flatnonzero(self._scene.model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
     points = [
       self._project(
-        np.concatenate([f.poses.geom_xpos[moving], *(h.path for h in f.hands)]), f
+        np.concatenate(
+          [f.poses.geom_xpos[moving], *(path.positions for path in f.tool_paths)]
+        ),
+        f,
       )
       for f in frames
     ]
@@ -113,14 +116,14 @@ class Painter:
       yield self._sheet.figure.text(at, s=text, color=color, **place | weight)
 
   def _overlay(self, axis: Axes, frame: Frame) -> Iterator[Artist]:
-    """Draws ways and ghost hands of the primitives over the image of the scene."""
+    """Draws the tool paths and ghost hands of the primitives over the scene."""
     parts = self._hand.parts(frame.poses)
     likely = int(np.argmax(frame.shares))
     for k in np.argsort(frame.shares):  # The likeliest is on top.
-      hand, share, color = frame.hands[k], float(frame.shares[k]), COLORS[k]
+      path, share, color = frame.tool_paths[k], float(frame.shares[k]), COLORS[k]
       strength = 0.25 + 0.75 * share
-      way = self._project(hand.path, frame)
-      ghost = [self._project(x @ hand.mat.T + hand.path[-1], frame) for x in parts]
+      way = self._project(path.positions, frame)
+      ghost = [self._project(x @ path.mat.T + path.positions[-1], frame) for x in parts]
       yield axis.add_patch(
         PathPatch(
           _union(ghost),
@@ -160,11 +163,11 @@ class Painter:
     return np.c_[_VIEW[1] / 2 + focal * x / depth, _VIEW[0] / 2 - focal * y / depth]
 
 
-def film(player: Player, path: Path, *, episodes: int) -> tuple[Path, int]:
+def record(player: Player, path: Path, *, episodes: int) -> tuple[Path, int]:
   """Plays episodes and writes them as a video.
 
   Args:
-    player: Plays them; it draws the camera ``wide`` in the size ``WIDE``.
+    player: Plays the episodes; it draws the camera ``wide`` in the size ``WIDE``.
     path: File to write, see ``video.write_video``.
     episodes: Number of episodes.
 

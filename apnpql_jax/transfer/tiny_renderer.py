@@ -3,7 +3,7 @@
 It draws on the CPU, without a graphics library. Every geom is a body of its own, at the
 poses of MuJoCo's kinematics, so that it draws worlds of any physics. One light shines,
 and surfaces have no checkers or waves. Images are rendered larger and resized by area,
-as those of ``opengl``.
+as those of ``opengl_renderer``.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from apnpql_jax.transfer.graphics import (
   light_of,
   rendered_sizes,
 )
-from apnpql_jax.transfer.shapes import shape
+from apnpql_jax.transfer.visual_shapes import visual_shape
 
 KEPT = MAX_WORLDS
 """Worlds that stay loaded: as many as are played in parallel."""
@@ -44,11 +44,11 @@ _NEAR, _FAR = 0.01, 10.0  # m
 _LIGHT_M = 3.0  # m, where the light stands for its shadows
 
 
-class Tiny:
-  """Draws worlds one after the other."""
+class TinyRenderer:
+  """PyBullet's TinyRenderer, which draws worlds one after the other."""
 
   def __init__(self, scene: Scene, config: EnvConfig, *, unseen: Collection[str]):
-    """Prepares the textures; the arguments are those of ``OpenGL``.
+    """Prepares the textures; the arguments are those of ``OpenGLRenderer``.
 
     Raises:
       ConfigError: The scene has meshes.
@@ -64,7 +64,7 @@ class Tiny:
     self._worlds: OrderedDict[Any, _World] = OrderedDict()
     self._textures = tempfile.TemporaryDirectory()
 
-  def __enter__(self) -> Tiny:
+  def __enter__(self) -> TinyRenderer:
     return self
 
   def __exit__(self, *error: object) -> None:
@@ -82,7 +82,7 @@ class Tiny:
   ) -> list[np.ndarray]:
     """Returns the images u8[H, W, 3] of the global and the wrist camera.
 
-    The arguments are those of ``OpenGL.draw``.
+    The arguments are those of ``OpenGLRenderer.draw``.
     """
     look = looks.draw(row, self._model.nbody) if self._unseen else None
     world = self._world_of(field_of(self._model, fields, "geom_size"), row, look)
@@ -223,7 +223,9 @@ class _World:
     self, kind: int, size: np.ndarray, rgb: Any, texture: tuple[str, int] | None
   ) -> int:
     client, rgba = self.client, [*np.asarray(rgb, float).tolist(), 1.0]
-    visual = client.createVisualShape(rgbaColor=rgba, **shape(client, kind, size))
+    visual = client.createVisualShape(
+      rgbaColor=rgba, **visual_shape(client, kind, size)
+    )
     body = client.createMultiBody(0, -1, visual)
     if texture:
       number = self._texture(*texture)

@@ -1,4 +1,4 @@
-"""Worlds in PyBullet, for the loop of ``play``."""
+"""Worlds in PyBullet, for the loop of ``host_rollout.play``."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import numpy as np
 from apnpql_jax.envs.env import Env
 from apnpql_jax.envs.state import Arrival, EnvState
 from apnpql_jax.transfer import urdf
-from apnpql_jax.transfer.plant import Plant
+from apnpql_jax.transfer.bullet_plant import BulletPlant
 from apnpql_jax.types import Array
 
 
-class Worlds:
-  """A plant per world, for the loop of ``play``."""
+class BulletWorlds:
+  """Worlds that PyBullet moves, with a plant for each."""
 
   def __init__(self, env: Env, *, latency_s: float, admittance: bool):
     """Keeps the settings; simulators are opened when they are needed.
@@ -29,10 +29,10 @@ class Worlds:
     self._stack = contextlib.ExitStack()
     self._env = env
     self._options: dict[str, Any] = {"latency_s": latency_s, "admittance": admittance}
-    self.plants: list[Plant] = []
-    """By world; ``advance`` adds them."""
+    self.plants: list[BulletPlant] = []
+    """Plants by world; ``advance`` adds them."""
 
-  def __enter__(self) -> Worlds:
+  def __enter__(self) -> BulletWorlds:
     return self
 
   def __exit__(self, *error: object) -> None:
@@ -48,7 +48,7 @@ class Worlds:
     physics: Any = jax.tree.map(np.array, state.physics)
     commands, elapsed = np.asarray(action), np.asarray(state.elapsed)
     while len(self.plants) < len(running):
-      plant = Plant(self._env.task.scene, **self._options)
+      plant = BulletPlant(self._env.task.scene, **self._options)
       self.plants.append(self._stack.enter_context(plant))
     for world in np.flatnonzero(running):
       plant = self.plants[world]

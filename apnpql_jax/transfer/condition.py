@@ -1,4 +1,4 @@
-"""A cell of the table of transfer: physics, renderer and looks."""
+"""The condition of a transfer test: physics, renderer and looks of the worlds."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 from apnpql_jax.envs.env import Env
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.transfer import bullet, looks
-from apnpql_jax.transfer.opengl import OpenGL
-from apnpql_jax.transfer.tiny import Tiny
-from apnpql_jax.transfer.worlds import Worlds
+from apnpql_jax.transfer.bullet_worlds import BulletWorlds
+from apnpql_jax.transfer.opengl_renderer import OpenGLRenderer
+from apnpql_jax.transfer.tiny_renderer import TinyRenderer
 
-Renderer = OpenGL | Tiny
-"""Draws images outside of JAX."""
+Renderer = OpenGLRenderer | TinyRenderer
+"""A renderer outside of JAX."""
 
 PHYSICS = ("mjx", "native", "bullet")
 RENDERERS = ("rays", "opengl", "tiny")
@@ -25,8 +25,8 @@ LATENCY_MS = 30
 
 
 @dataclasses.dataclass(frozen=True)
-class Cell:
-  """What the worlds of a test consist of."""
+class Condition:
+  """What the worlds of a transfer test consist of."""
 
   physics: str = "native"
   """Engine, one of ``PHYSICS``."""
@@ -43,13 +43,13 @@ class Cell:
 
   latency_ms: int | None = None
   """Time from the virtual arm to the servos, one of ``LATENCIES_MS``; 30 if None.
-  Only with Bullet, as the next one."""
+  Only with Bullet."""
 
   admittance: bool = False
-  """Whether the virtual arm yields to the wrench at the tool."""
+  """Whether the virtual arm yields to the wrench at the tool. Only with Bullet."""
 
   def check(self) -> None:
-    """Raises ``ConfigError`` if there is no such cell, or a package is missing."""
+    """Raises ``ConfigError`` if a value is invalid or a package is missing."""
     check_name("--physics", self.physics, PHYSICS)
     check_name("--renderer", self.renderer, RENDERERS)
     check_name("--looks", self.looks, LOOKS)
@@ -71,7 +71,7 @@ class Cell:
         bullet.require(f"{option} {value}")
 
   def about(self) -> dict[str, Any]:
-    """Returns the parts of the result that describe the cell."""
+    """Returns the items of a result that describe the condition."""
     about = {k: getattr(self, k) for k in ("physics", "renderer", "looks")}
     if self.physics == "bullet":
       about |= {"latency_ms": self._latency_ms, "admittance": self.admittance}
@@ -86,16 +86,16 @@ class Cell:
   def _latency_ms(self) -> int:
     return LATENCY_MS if self.latency_ms is None else self.latency_ms
 
-  def make_worlds(self, env: Env) -> Worlds | None:
+  def make_worlds(self, env: Env) -> BulletWorlds | None:
     """Returns Bullet's worlds; None if the environment has the physics itself."""
     if self.physics != "bullet":
       return None
     latency_s = self._latency_ms / 1000
-    return Worlds(env, latency_s=latency_s, admittance=self.admittance)
+    return BulletWorlds(env, latency_s=latency_s, admittance=self.admittance)
 
   def make_renderer(self, env: Env) -> Renderer | None:
     """Returns the renderer; None if the environment draws the images itself."""
-    draws = {"opengl": OpenGL, "tiny": Tiny}
+    draws = {"opengl": OpenGLRenderer, "tiny": TinyRenderer}
     if self.renderer not in draws:
       return None
     unseen = set(looks.PARTS) - set(self.without) if self.looks == "unseen" else ()

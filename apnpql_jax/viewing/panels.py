@@ -1,4 +1,4 @@
-"""The plots of an episode on a sheet: strips over time, and the present instant."""
+"""Panels of a sheet: both cameras, the strips over time, and the present instant."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def place_cameras(sheet: Sheet, box: Box, frame: Frame) -> dict[str, Axes]:
   return axes
 
 
-class Strips:
-  """Strips over time within a box of a sheet."""
+class StripsPanel:
+  """Strips over time, one above the other in a box of a sheet."""
 
   def __init__(self, sheet: Sheet, box: Box, *, epsilon: float | None):
     """Keeps the place; ``epsilon`` is the limit of the KL divergence, if any."""
@@ -77,7 +77,7 @@ class Strips:
       yield axis.axvline(frames[-1].time_s, color=INK, linewidth=0.8, alpha=0.5)
 
 
-class Instant:
+class InstantPanel:
   """Joint velocities of candidates, means and action at an instant, in a box."""
 
   def __init__(self, sheet: Sheet, box: Box):
@@ -99,21 +99,21 @@ class Instant:
   def draw(self, frame: Frame) -> Iterator[Artist]:
     """Adds a frame; the gripper's command is from -1, open, to 1, closed."""
     axis, x = self._axis, np.arange(ARM_DOF + 1)
-    thought: Any = frame.explanation
-    if thought is not None:
-      weights = np.sqrt(thought.weights / thought.weights.max())
+    explanation: Any = frame.explanation
+    if explanation is not None:
+      weights = np.sqrt(explanation.weights / explanation.weights.max())
       spread = np.linspace(-0.16, 0.16, len(weights))[:, None]
       repeat: Any = {"repeats": ARM_DOF + 1, "axis": 0}
       yield axis.scatter(
         (x + spread).ravel(),
-        _signed(thought.candidates).ravel(),
+        _signed(explanation.candidates).ravel(),
         s=np.repeat(np.maximum(30 * weights, 3), **repeat),
         c=np.repeat(strips.candidate_colors(frame), **repeat),
         alpha=0.35,
         linewidths=0,
       )
-      if thought.prior is not None:
-        parts = thought.prior.means, thought.prior.shares, strips.palette(frame)
+      if (prior := explanation.prior) is not None:
+        parts = prior.means, prior.shares, strips.palette(frame)
         for mean, share, color in zip(*parts, strict=True):
           style: Any = {"color": color, "linewidth": 1.2 + 3 * float(share)}
           yield axis.hlines(_signed(mean), x - 0.32, x + 0.32, **style)
