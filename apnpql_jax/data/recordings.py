@@ -168,7 +168,8 @@ def _from_base(
   """Converts poses from the frame of the arm's controller to that of the scene."""
   data = mujoco.MjData(scene.model)
   mujoco.mj_kinematics(scene.model, data)
-  base, turn, turned = data.site(BASE_SITE), np.zeros(4), np.zeros(quat.shape)
+  base = data.site(BASE_SITE)
+  turn, turned = np.zeros(4), np.zeros(quat.shape)
   mujoco.mju_mat2Quat(turn, base.xmat)
   for result, q in zip(turned, np.ascontiguousarray(quat), strict=True):
     mujoco.mju_mulQuat(result, turn, q)

@@ -97,7 +97,8 @@ def _disk(name: str, folder: Path, cure: str) -> Iterator[Finding]:
   if free < _ROOM:
     change = f"{folder} has little room for checkpoints: free some, or {cure}"
   elif speed < _SLOW:
-    change, needed = f"the disk of {folder} is slow: {cure}", False
+    change = f"the disk of {folder} is slow: {cure}"
+    needed = False
   yield Finding(_DISK, name, text, change, needed)
 
 

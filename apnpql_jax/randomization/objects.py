@@ -100,7 +100,9 @@ def _heights(world: World, qpos: Array) -> Array:
 
 def _reach(kind: np.ndarray, size: Array, way: Array) -> Array:
   """Returns how far geoms reach from their centers along unit vectors f32[n, 3], m."""
-  kinds, radius, length = mujoco.mjtGeom, size[:, 0], size[:, 1] * jnp.abs(way[:, 2])
+  kinds = mujoco.mjtGeom
+  radius = size[:, 0]
+  length = size[:, 1] * jnp.abs(way[:, 2])
   reaches = {
     kinds.mjGEOM_SPHERE: radius,
     kinds.mjGEOM_CAPSULE: radius + length,

@@ -56,12 +56,14 @@ def make_appearance(
   ids, light = geoms.ids, lighting.id
   colors = pick("geom_rgba", np.s_[ids, :3], geoms.colors)
   background = pick("background", None, np.array([lighting.background], np.float32))
-  odd, texture = _concatenate(geoms.checker_colors, background), None
+  odd = _concatenate(geoms.checker_colors, background)
+  texture = None
   if "waves" in fields:
     rows = np.append(ids, -1)
     texture = Texture(fields["waves"][rows], fields["grain"][rows])
     odd = fields["odd_rgb"][rows]
-  basis, zoom = light_basis(lighting.direction), None
+  basis = light_basis(lighting.direction)
+  zoom = None
   if "light_dir" in fields:
     basis = light_basis(fields["light_dir"][light], jnp)
   if "cam_fovy" in fields:

@@ -49,12 +49,14 @@ class Geoms:
     rgba, untextured = colors.geom_rgba(model), colors.material_rgba(model)
     ids = np.flatnonzero((rgba[:, 3] > 0) & np.isin(model.geom_group, groups))
     ids = ids[np.argsort(model.geom_type[ids], kind="stable")]
-    checker, odd_colors, hulls = np.zeros(len(ids)), np.zeros((len(ids), 3)), {}
+    checker, odd_colors = np.zeros(len(ids)), np.zeros((len(ids), 3))
     sizes = model.geom_size[ids].copy()
+    hulls = {}
     for k, i in enumerate(ids):
       _check_type(model, i)
       if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_MESH:
-        hulls[k], sizes[k] = _read_hull(model, i), np.maximum(sizes[k], THIN)
+        hulls[k] = _read_hull(model, i)
+        sizes[k] = np.maximum(sizes[k], THIN)
       if (texture := colors.read_texture(model, i)) is not None:
         checker[k], odd_colors[k] = texture.edge, untextured[i, :3] * texture.odd
         if not texture.edge:
@@ -178,7 +180,8 @@ def _title(model: mujoco.MjModel, geom_id: int) -> str:
 
 
 def _check_type(model: mujoco.MjModel, geom_id: int) -> None:
-  kind, valid = int(model.geom_type[geom_id]), (*HITS, int(mujoco.mjtGeom.mjGEOM_MESH))
+  kind = int(model.geom_type[geom_id])
+  valid = (*HITS, int(mujoco.mjtGeom.mjGEOM_MESH))
   if kind not in valid:
     found, *names = (
       mujoco.mjtGeom(x).name.removeprefix("mjGEOM_").lower() for x in (kind, *valid)

@@ -177,7 +177,8 @@ class Control:
       self._target, self._closed = order["target"].copy(), bool(order["close"])
       home = self._phase is Phase.HOME
       refusal = self._zero.start(self._arm, again=not home)
-      goal, self._began = self._target if home else None, self._clock.now()
+      goal = self._target if home else None
+      self._began = self._clock.now()
       self._core.start(self._began, self._arm.get_observation(), goal)
       self._core.supervisor.stop(refusal)
       self._last = 0.0

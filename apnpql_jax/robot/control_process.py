@@ -82,7 +82,9 @@ def _loop(control: Control, clock: Clock, peer: Connection) -> None:
   poll = select.poll()
   for source in (peer.fileno(), *([int(parent.sentinel)] if parent else [])):
     poll.register(source, select.POLLIN | select.POLLHUP)
-  ended, due, patience = "", clock.now(), REST_S
+  ended = ""
+  due = clock.now()
+  patience = REST_S
   while True:
     if not ended:
       for source, _ in poll.poll(0):

@@ -136,7 +136,8 @@ class _Reader:
     config: TrainConfig | None,
   ) -> Restored:
     """Returns the items; the arguments are those of the function ``restore``."""
-    step, record = self._step, checkpoint_record.read(self._run_dir, self._step)
+    step = self._step
+    record = checkpoint_record.read(self._run_dir, step)
     saved = config and _config(title(self._run_dir, step), record.config, config)
     wanted = examples if isinstance(examples, Mapping) else examples(saved)
     steps = {

@@ -118,7 +118,8 @@ def evaluate(
     ConfigError: An argument is invalid; nothing was built.
     FileError: Not a run folder, or no readable checkpoint.
   """
-  began, video = time.monotonic(), _check(episodes, seed, video)
+  began = time.monotonic()
+  video = _check(episodes, seed, video)
   if acting is not None:
     check_name("acting", acting, ACTING)
   config, env, agent, params, step = load_trained(
@@ -231,7 +232,8 @@ def evaluate_expert(
 
   ``noise`` is the standard deviation of the noise on its joint velocities in rad/s.
   """
-  began, video = time.monotonic(), _check(episodes, seed, video)
+  began = time.monotonic()
+  video = _check(episodes, seed, video)
   if not 0.0 <= noise < math.inf:
     raise ConfigError(f"noise={noise} must be a finite number of at least 0")
   env = make_env(env_config)

@@ -125,7 +125,8 @@ def load(
       "robot calibrate"
     )
   for name in contract["cameras"]:
-    camera, (_, entry) = calibration.cameras[name], limits.place(contract, name)
+    camera = calibration.cameras[name]
+    _, entry = limits.place(contract, name)
     if camera.entry != entry:
       raise FileError(f"{path}: the {name} camera has no {entry}")
     if serials is not None and serials[name] != camera.serial:

@@ -136,7 +136,8 @@ def _first_guess(problem: Problem, poses: np.ndarray) -> tuple[np.ndarray, np.nd
   rng, count = np.random.default_rng(0), len(poses)
   subsets = [np.arange(count)]
   subsets += [rng.permutation(count)[:_SUBSET] for _ in range(_SUBSETS)]
-  hands, guesses = np.linalg.inv(problem.motion), []
+  hands = np.linalg.inv(problem.motion)
+  guesses = []
   for rows in subsets:
     camera = hand_eye(hands[rows], poses[rows])
     guesses.append((camera, _mean_pose(hands[rows] @ camera @ poses[rows])))
@@ -147,7 +148,8 @@ def _without_outliers(
   problem: Problem, camera: np.ndarray, board: np.ndarray, *, fixed: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
   """Refines the poses, leaves out views that contradict them, and refines again."""
-  kept, px_per_mrad = np.ones(len(problem.seen), bool), problem.lens.fx / 1e3
+  px_per_mrad = problem.lens.fx / 1e3
+  kept = np.ones(len(problem.seen), bool)
   camera, board, _ = refine(problem, camera, board, fixed=fixed, robust=True)
   for _ in range(5):
     error = problem.error_of_views(camera, board)
@@ -192,7 +194,9 @@ def _residuals(
   """Returns errors on all views, on views that were held out, and uncertainties."""
   _, _, found = refine(problem, camera, board, fixed=fixed)
   deviation = deviations(found)
-  rows, folds, held_out = np.arange(len(poses)), min(_FOLDS, len(poses)), []
+  rows = np.arange(len(poses))
+  folds = min(_FOLDS, len(poses))
+  held_out = []
   for fold in range(folds):
     test = rows % folds == fold
     cameras = refine(problem.select(rows[~test]), camera, board, fixed=fixed)[:2]

@@ -193,7 +193,8 @@ def _at_rest(
     state, frame = arm.get_observation(), camera.get_native()
     moved = np.abs(state.position - start).max() > _SAME
     if moved or np.abs(state.velocity).max() > _STILL:
-      since, start = time.monotonic(), state.position
+      since = time.monotonic()
+      start = state.position
     elif frame.time > since + _SETTLE_S and state.time > since + _SETTLE_S:
       return state.position, frame.image
     time.sleep(0.02)

@@ -24,7 +24,7 @@ def check(
   Raises:
     DeviceError: A simulated robot does not start.
   """
-  contract, table, loaded = robot.contract, Table(), False
+  contract, table = robot.contract, Table()
   table.rows = {
     "policy": f"{policy.path}: {contract['task']}, every "
     f"{contract['control_period_s']} s for {contract['time_limit_s']} s",
@@ -36,8 +36,10 @@ def check(
   with table.row("calibration"):
     setup.check_calibration(robot)
   act = program.rest
+  loaded = False
   with table.row("program"):  # First, because simulated cameras need JAX set up.
-    act, loaded = policy_process.load_program(policy, seed=0), True
+    act = policy_process.load_program(policy, seed=0)
+    loaded = True
   with contextlib.ExitStack() as stack:
     robot = stack.enter_context(started(robot))
     senses = program.Senses(

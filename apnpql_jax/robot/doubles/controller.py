@@ -160,7 +160,8 @@ class Controller:
     if command == _NO_COMMAND:
       self._executing, self._answer = False, _READY
     elif command == _SERVO:
-      joints, (*_, lookahead, gain) = self._doubles(len(ARM_JOINTS)), self._doubles(11)
+      joints = self._doubles(len(ARM_JOINTS))
+      *_, lookahead, gain = self._doubles(11)
       self.plant.servo(np.array(joints), lookahead, gain)
       self._answer = _READY
     elif not self._executing:

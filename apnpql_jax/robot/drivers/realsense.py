@@ -221,8 +221,9 @@ class RealSense:
       when = self._captured(frame)
       if self._native is None or when > self._native.time:
         # A copy, as librealsense has few buffers, which it uses again.
-        self._native, new = Frame(when, np.array(frame.get_data())), True
+        self._native = Frame(when, np.array(frame.get_data()))
         self._arrival = time.monotonic()
+        new = True
     return new
 
   def _captured(self, frame: Any) -> float:
