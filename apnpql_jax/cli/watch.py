@@ -1,4 +1,4 @@
-"""The command ``watch``: its options, and what it runs."""
+"""The command ``apnpql watch``."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def watch(args: Watch) -> Json:
 
 
 def _actor(args: Watch) -> Actor:
-  """Builds who acts."""
+  """Builds the actor."""
   from apnpql_jax.viewing import actors
 
   if args.task:

@@ -28,7 +28,7 @@ INTERRUPTS = (
 
 @dataclasses.dataclass(frozen=True)
 class Robot:
-  """Which robot to open; crosses the borders of processes."""
+  """Description of the robot to open, which is sent to other processes."""
 
   kind: str
   """One of ``ROBOTS``."""
