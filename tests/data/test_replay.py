@@ -184,7 +184,7 @@ def test_windows_are_the_slots_after_the_start_across_the_seam():
 
 
 def _up_to(step: TimeStep, t: int, w: int, instants: int) -> list[int]:
-  """Returns the last slots of an episode up to t; the first one stands in for others."""
+  """Returns the last slots of an episode up to t; the first one fills the others."""
   slots = [t]
   while len(slots) < instants:
     t -= not (step.terminated[t - 1, w] or step.truncated[t - 1, w])
