@@ -41,6 +41,13 @@ def one_line(error: BaseException) -> str:
   return " ".join(str(error).split())[:200] or type(error).__name__
 
 
+def reason(error: BaseException) -> str:
+  """Returns an exception as one line; with its type unless it is for the user."""
+  if isinstance(error, UserError):
+    return one_line(error)
+  return f"{type(error).__name__}: {one_line(error)}"
+
+
 def check_name(field: str, value: str, valid: Sequence[str]) -> None:
   """Raises ``ConfigError``, which lists the choices, unless ``value`` is valid."""
   if value not in valid:

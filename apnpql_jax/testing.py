@@ -144,7 +144,7 @@ def export_untrained(
   seen = observation_shapes(config, task, lstm_instants=agent.lstm_instants)
   zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), seen)
   params = learner.init(jax.random.key(1), zeros).params
-  shapes = contract.fields(seen)
+  shapes = seen.present()
   made = program.export(program.make_act(learner, params, acting="policy"), shapes)
   about = {
     "contract": VERSION,

@@ -12,6 +12,8 @@ period of one world.
 
 from __future__ import annotations
 
+from typing import Any
+
 from flax import struct
 import jax
 from jaxtyping import Bool, Float, UInt8
@@ -50,6 +52,10 @@ class Observation(struct.PyTreeNode):
 
   primitives: Float[Array, "*b 3 7"] | None = None
   """The labels of ``TimeStep``; only with ``env.true_primitives``."""
+
+  def present(self) -> dict[str, Any]:
+    """Returns the modalities that are not absent, by name."""
+    return {name: x for name, x in vars(self).items() if x is not None}
 
 
 class TimeStep(struct.PyTreeNode):

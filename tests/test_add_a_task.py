@@ -91,12 +91,12 @@ def test_the_task_of_the_guide_runs(tmp_path: Path):
 
 SETTINGS = """
 import sys
-from apnpql_jax.cli import commands, main, sweep
-from apnpql_jax.cli.options import Train
+from apnpql_jax.cli import main, sweep
+from apnpql_jax.cli.train import Train, with_shortcuts
 from apnpql_jax.config.checks import validate
 from apnpql_jax.tasks import task_names
 
-trained = commands.with_shortcuts(main._parse(Train, sys.argv[1:]))
+trained = with_shortcuts(main._parse(Train, sys.argv[1:]))
 validate(trained, tasks=task_names())
 assert trained == sweep.config_of(sys.argv[2:])
 print(trained.env.task, trained.env.task_file)

@@ -136,8 +136,9 @@ def test_without_home_and_passwd_entry_commands_work_but_nothing_is_kept():
   line = "you have no home folder; compiled programs are not kept (set XDG_CACHE_HOME)"
   code = (
     "import os, sys, pwd; sys.stderr = sys.stdout; del os.environ['HOME'];"
-    "from apnpql_jax.cli import commands, main, options;"
-    "commands.list_names(options.List()); os.setuid(54321);"
+    "from apnpql_jax.cli import main;"
+    "from apnpql_jax.cli.list_names import List, list_names;"
+    "list_names(List()); os.setuid(54321);"
     "main.main(['--help']); main.main(['list'])"
   )
   _, _, shown = run(code, XDG_CACHE_HOME="").partition("usage: apnpql COMMAND")

@@ -9,7 +9,8 @@ from typing import Any, ClassVar
 import tyro
 
 from apnpql_jax.cli.options import Command, File
-from apnpql_jax.cli.plot import Band, check_output
+from apnpql_jax.cli.outputs import check_output
+from apnpql_jax.cli.plot import Band
 from apnpql_jax.errors import ConfigError
 
 

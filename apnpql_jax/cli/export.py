@@ -8,13 +8,13 @@ from typing import Any
 
 import tyro
 
-from apnpql_jax.cli.commands import checkpoint_step, existing_run
-from apnpql_jax.cli.options import Acting, Flag, OfRun
+from apnpql_jax.cli.inputs import checkpoint_step, existing_run
+from apnpql_jax.cli.options import Flag, OfCheckpoint
 from apnpql_jax.errors import ConfigError
 
 
 @dataclasses.dataclass(frozen=True)
-class Export(OfRun):
+class Export(OfCheckpoint):
   """Exports a policy to use without this package: apnpql export RUN FOLDER [options].
 
   FOLDER gets the program with its weights, a contract in JSON, and an example.
@@ -24,17 +24,8 @@ class Export(OfRun):
   apnpql export runs/mine policy --checkpoint best --acting mean
   """
 
-  run: tyro.conf.Positional[str] = ""
-  """Run folder."""
-
   folder: tyro.conf.Positional[str] = ""
   """Folder to make."""
-
-  checkpoint: str = "newest"
-  """Checkpoint: newest, best (highest success rate in training) or its step."""
-
-  acting: Acting = None
-  """How to choose an action, see `apnpql evaluate --help`."""
 
   overwrite: Flag = False
   """Replace an earlier export."""

@@ -13,18 +13,11 @@ import sys
 from typing import Any
 
 from apnpql_jax import __version__, errors, runtime
-from apnpql_jax.cli import commands, options, text, watch
-from apnpql_jax.cli.commands import Json
-from apnpql_jax.cli.compare import Compare, compare
-from apnpql_jax.cli.completion import Completion, completion
-from apnpql_jax.cli.doctor import Doctor, doctor
-from apnpql_jax.cli.export import Export, export
-from apnpql_jax.cli.new_task import NewTask, new_task
-from apnpql_jax.cli.options import Train, parse
-from apnpql_jax.cli.plot import Plot, plot
-from apnpql_jax.cli.robot import Robot, robot
-from apnpql_jax.cli.sweep import Sweep, parse_sweep, sweep
-from apnpql_jax.cli.transfer import Transfer, transfer
+from apnpql_jax.cli import text
+from apnpql_jax.cli.commands import COMMANDS, OPTIONS
+from apnpql_jax.cli.options import parse
+from apnpql_jax.cli.sweep import Sweep, parse_sweep
+from apnpql_jax.cli.train import Train, base_config
 from apnpql_jax.config import files, user_files
 from apnpql_jax.console import Unfailing, print_line, reporting
 from apnpql_jax.errors import ConfigError, UserError, check_name
@@ -43,15 +36,15 @@ def main(argv: Sequence[str] | None = None) -> int:
   args = list(sys.argv[1:] if argv is None else argv)
   try:
     if not args:
-      raise ConfigError(f"name a command: {', '.join(_COMMANDS)} (see apnpql --help)")
+      raise ConfigError(f"name a command: {', '.join(COMMANDS)} (see apnpql --help)")
     if args[0] in ("-h", "--help"):
       _print(_help())
       return 0
     if args[0] == "--version":
       _print(__version__)
       return 0
-    check_name("command", args[0], list(_COMMANDS))
-    kind, command = _COMMANDS[args[0]]
+    check_name("command", args[0], list(COMMANDS))
+    kind, command = COMMANDS[args[0]]
     if kind.uses_jax:
       runtime.configure()
       runtime.collect_garbage_less_often()
@@ -97,8 +90,8 @@ def _parse(kind: type[Any], args: Sequence[str]) -> Any:
   default = None
   if preset := next(filter(files.is_preset, words), ""):
     named = Train(preset=preset, task_file=file)
-    default = Train(config=commands.base_config(named))
-  base = commands.base_config(parse(Train, name, rest, default=default))
+    default = Train(config=base_config(named))
+  base = base_config(parse(Train, name, rest, default=default))
   return parse(Train, name, rest, default=Train(config=base))
 
 
@@ -147,14 +140,14 @@ def _plain(value: Any) -> Any:
   return value if isinstance(value, str | int | float | None) else str(value)
 
 
-def _show(result: Json) -> str:
+def _show(result: dict[str, Any]) -> str:
   """Returns the result as one line per entry, for people, or its ``text``."""
   if "text" in result:
     return result["text"].rstrip()
   return "\n".join(text.rows((name, _text(x)) for name, x in _rows(result)))
 
 
-def _rows(result: Json) -> Generator[tuple[str, Any], None, None]:
+def _rows(result: dict[str, Any]) -> Generator[tuple[str, Any], None, None]:
   """Yields names and values; a dict of dicts or lists has one row for each."""
   for name, value in result.items():
     parts = value.values() if isinstance(value, dict) else ()
@@ -179,7 +172,7 @@ def _number(value: Any) -> str:
 
 
 def _help() -> str:
-  about = [(f"  {name}", _summary(kind)) for name, kind in _options().items()]
+  about = [(f"  {name}", _summary(kind)) for name, kind in OPTIONS.items()]
   lines = ["usage: apnpql COMMAND [options]", "", *text.rows(about), ""]
   return "\n".join([*lines, *text.wrapped("apnpql COMMAND --help shows its options.")])
 
@@ -187,28 +180,3 @@ def _help() -> str:
 def _summary(kind: type[Any]) -> str:
   """Returns the first line about a command, without its usage."""
   return (kind.__doc__ or "").splitlines()[0].partition(": apnpql")[0].rstrip(".")
-
-
-def _options() -> dict[str, type[Any]]:
-  return {name: kind for name, (kind, _) in _COMMANDS.items()}
-
-
-_COMMANDS: dict[str, tuple[type[Any], Callable[[Any], Json]]] = {
-  "train": (Train, commands.train),
-  "evaluate": (options.Evaluate, commands.evaluate),
-  "diagnose": (options.Diagnose, commands.diagnose),
-  "watch": (watch.Watch, watch.watch),
-  "export": (Export, export),
-  "transfer": (Transfer, transfer),
-  "robot": (Robot, robot),
-  "collect": (options.Collect, commands.collect),
-  "convert": (options.Convert, commands.convert),
-  "repeat": (options.Repeat, commands.repeat),
-  "sweep": (Sweep, sweep),
-  "plot": (Plot, plot),
-  "compare": (Compare, compare),
-  "new-task": (NewTask, new_task),
-  "list": (options.List, commands.list_names),
-  "doctor": (Doctor, doctor),
-  "completion": (Completion, lambda args: completion(args, _options())),
-}

@@ -13,7 +13,6 @@ from typing import Annotated, ClassVar, TypeVar
 
 import tyro
 
-from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import ConfigError
 
 T = TypeVar("T")
@@ -25,7 +24,6 @@ def default_hint(text: str) -> object:
 
 
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
-_OfPreset = Annotated[str | None, default_hint("(default: as in the preset)")]
 Count = Annotated[int | None, default_hint("")]
 AsTrained = Annotated[str | None, default_hint("(default: as in training)")]
 Acting = Annotated[
@@ -54,7 +52,9 @@ class OfRun(Command):
 
 
 @dataclasses.dataclass(frozen=True)
-class _Play(Command):
+class Play(Command):
+  """Options of commands that play episodes and can film them."""
+
   episodes: int = 200
   """Number of episodes."""
 
@@ -69,70 +69,22 @@ class _Play(Command):
 
 
 @dataclasses.dataclass(frozen=True)
-class Train(OfRun):
-  """Trains an agent: apnpql train PRESET [options].
+class OfCheckpoint(OfRun):
+  """Options of commands that act with a checkpoint of a run."""
 
-  Every setting of the preset can be overridden, e.g. --agent.epsilon 0.5.
-
-  apnpql train push_plate --seed 1 --run runs/mine
-
-  apnpql train --resume runs/mine
-  """
-
-  preset: tyro.conf.Positional[str] = ""
-  """Preset to start from; `apnpql list` shows all. Or the path of a file with a preset
-  and its task, such as ./my_task.py."""
-
-  run: Annotated[Path | None, default_hint("(default: first free runs/PRESET-<n>)")] = (
-    None
-  )
-  """Run folder to create."""
-
-  resume: File = None
-  """Run folder to resume from its latest checkpoint."""
-
-  init_from: Annotated[str | None, default_hint("")] = None
-  """Run with whose weights the new one starts: RUN (its newest checkpoint), RUN:STEP or
-  RUN:best."""
-
-  overwrite: Flag = False
-  """Replace the existing run in --run."""
-
-  backend: _OfPreset = None
-  """Short for --env.backend: auto, mjx or native."""
-
-  obs: _OfPreset = None
-  """Short for --env.obs: pixels or state."""
-
-  algorithm: _OfPreset = None
-  """Short for --agent.algorithm; `apnpql list` shows all."""
-
-  devices: int = 1
-  """Devices that share the worlds and batches; 0: all (always with --coordinator). Not
-  stored in the run: pass it again with --resume."""
-
-  coordinator: str = ""
-  """Address and port of the first of several processes, or auto to take it and the next
-  two options from the batch system; see docs/scaling.md."""
-
-  processes: Count = None
-  """Number of processes that share the run."""
-
-  process: Count = None
-  """Index of this process, from 0."""
-
-  config: Annotated[TrainConfig, tyro.conf.arg(name="")] = dataclasses.field(
-    default_factory=TrainConfig
-  )
-
-
-@dataclasses.dataclass(frozen=True)
-class _HeldOut(OfRun):
   run: tyro.conf.Positional[str] = ""
   """Run folder."""
 
   checkpoint: str = "newest"
   """Checkpoint: newest, best (highest success rate in training) or its step."""
+
+  acting: Acting = None
+  """How to choose an action, see `apnpql evaluate --help`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class HeldOut(OfCheckpoint):
+  """Options of commands that play held-out episodes of a run."""
 
   acting: Acting = None
   """How to choose an action: policy draws from the policy; mean takes the component
@@ -145,129 +97,6 @@ class _HeldOut(OfRun):
 
   backend: AsTrained = None
   """Physics engine: auto, mjx or native."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Evaluate(_Play, _HeldOut):
-  """Plays held-out episodes with a trained agent: apnpql evaluate RUN [options].
-
-  apnpql evaluate runs/mine --episodes 200 --seed 7
-
-  apnpql evaluate runs/mine --checkpoint best --video best.mp4
-  """
-
-
-@dataclasses.dataclass(frozen=True)
-class Diagnose(_HeldOut):
-  """Reports where and why an agent fails: apnpql diagnose RUN [options].
-
-  apnpql diagnose runs/mine
-
-  apnpql diagnose runs/mine --checkpoint best --episodes 128 --acting policy
-  """
-
-  episodes: int = 64
-  """Number of episodes of each acting rule."""
-
-  seed: int = 0
-  """Random seed of the episodes and of the policy."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Collect(_Play):
-  """Plays episodes with the scripted expert: apnpql collect TASK [options].
-
-  apnpql collect push_plate --video expert.mp4
-
-  apnpql collect push_plate --episodes 200 --noise 0.03 --save mine.npz
-
-  apnpql collect push_plate --save mine --format lerobot
-  """
-
-  task: tyro.conf.Positional[str] = ""
-  """Task to play, or the path of its file; `apnpql list` shows all."""
-
-  backend: str = "auto"
-  """Physics engine: auto, mjx or native."""
-
-  noise: float = 0.0
-  """Standard deviation of the noise on the expert's joint velocities (rad/s)."""
-
-  save: File = None
-  """Also record the same number of episodes, started from training resets, to this
-  demonstrations file or dataset folder."""
-
-  format: str = "npz"
-  """Format of --save: npz (demonstrations for training) or lerobot (a dataset with
-  videos, for LeRobot)."""
-
-  append: Flag = False
-  """Add the episodes to --save if it exists."""
-
-  solved_only: Flag = False
-  """Save only solved episodes."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Convert(Command):
-  """Converts a recording to demonstrations: apnpql convert REC TASK OUT.npz.
-
-  apnpql convert recording.npz push_plate mine.npz
-
-  apnpql convert other.npz push_plate mine.npz --append --solved-only
-  """
-
-  recording: tyro.conf.Positional[str] = ""
-  """Joint trajectories and object poses (docs/demonstrations.md), another
-  demonstrations file, or the folder of a dataset of LeRobot, such as the log of a
-  simulated robot."""
-
-  task: tyro.conf.Positional[str] = ""
-  """Task of the recording, or the path of its file; `apnpql list` shows all."""
-
-  out: tyro.conf.Positional[str] = ""
-  """File to write, for --replay.demonstrations."""
-
-  append: Flag = False
-  """Add the episodes to the file if it exists."""
-
-  solved_only: Flag = False
-  """Keep only solved episodes."""
-
-  allow_unsolved: Flag = False
-  """Write the file even if no episode in it is solved."""
-
-  overwrite: Flag = False
-  """Replace the file if it exists."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Repeat(OfRun):
-  """Repeats an update with NaN or infinity: apnpql repeat RUN/faults/step_<n>.npz.
-
-  apnpql repeat runs/mine/faults/step_00001024.npz
-
-  apnpql repeat runs/mine/faults/step_00001024.npz --task-file my_task.py
-  """
-
-  file: tyro.conf.Positional[str] = ""
-  """File that a run wrote when it stopped, still in its run folder."""
-
-
-@dataclasses.dataclass(frozen=True)
-class List(Command):
-  """Lists the tasks, presets, algorithms and backends: apnpql list [FILE...].
-
-  apnpql list --json
-
-  apnpql list my_task.py --contacts
-  """
-
-  files: tyro.conf.Positional[tuple[Path, ...]] = ()
-  """Python files whose tasks to build and list as well."""
-
-  contacts: Flag = False
-  """Report contacts and physics speed of every scene instead; compiles for minutes."""
 
 
 def parse(kind: type[T], name: str, argv: Sequence[str], default: T | None = None) -> T:

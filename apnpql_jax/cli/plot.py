@@ -8,8 +8,8 @@ from typing import Any, ClassVar, Literal
 
 import tyro
 
-from apnpql_jax.atomic import check_utf8, check_writable
 from apnpql_jax.cli.options import Command
+from apnpql_jax.cli.outputs import check_output
 from apnpql_jax.errors import ConfigError, FileError
 
 Band = Literal["interval", "range"]
@@ -59,11 +59,3 @@ def plot(args: Plot) -> dict[str, Any]:
   axes = statistics.AXES if args.x == "both" else (args.x,)
   figure.save(groups.group(runs), args.out, axes=axes, band=args.band)
   return {"figure": str(args.out), "runs": len(runs)}
-
-
-def check_output(path: Path) -> None:
-  """Raises ``UserError`` if a file cannot be written there."""
-  check_utf8(path)
-  check_writable(path.absolute().parent)
-  if path.is_dir() or not path.absolute().parent.is_dir():
-    raise ConfigError(f"{path} is a folder or its parent is missing; name another file")

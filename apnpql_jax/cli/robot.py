@@ -100,9 +100,9 @@ def robot(args: Robot) -> dict[str, Any]:
     raise ConfigError(f"robot needs an action: {', '.join(ACTIONS)}")
   check_name("robot action", args.action, ACTIONS)
 
-  from apnpql_jax.robot import devices
+  from apnpql_jax.robot import description
 
-  devices.check_kind(args.robot)
+  check_name("--robot", args.robot, description.ROBOTS)
   _check_options(args)
   if args.print_board is not None:
     from apnpql_jax.robot.calibration import boards

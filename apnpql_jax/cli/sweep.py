@@ -10,8 +10,8 @@ from typing import Annotated, Any, ClassVar
 
 import tyro
 
-from apnpql_jax.cli import commands
-from apnpql_jax.cli.options import Command, Count, File, Train, default_hint, parse
+from apnpql_jax.cli.options import Command, Count, File, default_hint, parse
+from apnpql_jax.cli.train import Train, base_config, with_shortcuts
 from apnpql_jax.config import files, user_files
 from apnpql_jax.config.checks import validate
 from apnpql_jax.config.schema import TrainConfig
@@ -115,9 +115,9 @@ def config_of(argv: Sequence[str]) -> TrainConfig:
 def _options_of(argv: Sequence[str]) -> Train:
   """Returns the checked options of a run; equal options mean the same run."""
   named = Train(preset=argv[0], task_file=user_files.task_file(argv))
-  base = Train(config=commands.base_config(named))
+  base = Train(config=base_config(named))
   args = parse(Train, "train", argv, default=base)
-  config = commands.with_shortcuts(args)
+  config = with_shortcuts(args)
   validate(config)
   return dataclasses.replace(
     args, preset="", backend=None, obs=None, algorithm=None, config=config

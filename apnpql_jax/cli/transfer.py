@@ -8,13 +8,9 @@ from typing import Annotated, Any
 
 import tyro
 
-from apnpql_jax.cli.commands import (
-  check_free,
-  checkpoint_step,
-  existing_run,
-  task_env,
-)
+from apnpql_jax.cli.inputs import checkpoint_step, existing_run, task_env
 from apnpql_jax.cli.options import Acting, File, Flag, OfRun, default_hint
+from apnpql_jax.cli.outputs import check_free
 from apnpql_jax.errors import ConfigError
 
 EXPERT = "expert"

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from apnpql_jax.cli.commands import (
-  Json,
-  check_free,
-  checkpoint_step,
-  run_config,
-  task_env,
-)
+from apnpql_jax.cli.inputs import checkpoint_step, run_config, task_env
 from apnpql_jax.cli.options import Acting, AsTrained, File, Flag, OfRun
+from apnpql_jax.cli.outputs import check_free
 from apnpql_jax.console import print_line
 from apnpql_jax.errors import ConfigError
 
@@ -71,7 +67,7 @@ class Watch(OfRun):
   """Replace the video if it exists."""
 
 
-def watch(args: Watch) -> Json:
+def watch(args: Watch) -> dict[str, Any]:
   """Shows episodes in a browser until Ctrl-C, or writes a video of them."""
   if not args.what:
     raise ConfigError("watch needs a run folder, expert or random: apnpql watch RUN")
@@ -102,11 +98,11 @@ def watch(args: Watch) -> Json:
   check_server(args.host)
   newest = args.checkpoint == "newest"
   playback = Playback(Player(_actor(args), seed=args.seed), follow=newest)
-  view = LiveView(playback, host=args.host, port=args.port)
-  print_line(f"watch at {view.url}; Ctrl-C ends")
-  if args.host not in LOOPBACK:
-    print_line("everyone who can reach this machine can watch and press the buttons")
-  playback.run(view)
+  with contextlib.closing(LiveView(playback, host=args.host, port=args.port)) as view:
+    print_line(f"watch at {view.url}; Ctrl-C ends")
+    if args.host not in LOOPBACK:
+      print_line("everyone who can reach this machine can watch and press the buttons")
+    playback.run(view)
   return {}
 
 

@@ -18,7 +18,8 @@ from apnpql_jax.data import demonstrations, npz
 from apnpql_jax.data.demonstrations import Demonstrations
 from apnpql_jax.errors import FileError, UserError
 from apnpql_jax.sim.motors import MAX_VELOCITY
-from apnpql_jax.sim.scene import ARM_JOINTS, BASE_SITE, Scene, free_joints
+from apnpql_jax.sim.names import ARM_JOINTS, BASE_SITE
+from apnpql_jax.sim.scene import Scene, free_joints
 
 _CONVENTIONS: dict[str, dict[str, Any]] = {
   "time_unit": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},

@@ -20,19 +20,18 @@ from apnpql_jax.config import codec
 from apnpql_jax.config.schema import EnvConfig
 from apnpql_jax.runs import leaves
 from apnpql_jax.sim import motors
-from apnpql_jax.sim.scene import (
+from apnpql_jax.sim.names import (
   ARM_JOINTS,
   BASE_SITE,
+  FLANGE_SITE,
   GRIPPER_JOINT,
   TOOL_SITE,
-  Scene,
-  fixed_bodies,
 )
-from apnpql_jax.types import ACTION_DIM, Array, Observation
+from apnpql_jax.sim.scene import Scene, fixed_bodies
+from apnpql_jax.types import ACTION_DIM, Array
 
 Json = dict[str, Any]
 
-FLANGE_SITE = "attachment_site"
 STATE_NAMES = (*ARM_JOINTS, GRIPPER_JOINT)
 MEANINGS = {
   "robot": "last 3 robot states, oldest first, each in the order of joints.state; an "
@@ -206,8 +205,3 @@ def _shown(pose: _Pose) -> Json:
   mujoco.mju_mat2Quat(quat, np.asarray(pose[1], np.float64).reshape(9))
   pos, quat = (np.asarray(x, np.float64).round(9) + 0.0 for x in (pose[0], quat))
   return {"position_m": pos.tolist(), "quaternion_wxyz": quat.tolist()}
-
-
-def fields(observation: Observation) -> dict[str, Any]:
-  """Returns the fields of an observation that are present, by name."""
-  return {k: x for k, x in vars(observation).items() if x is not None}

@@ -64,9 +64,8 @@ def export(
   task = tasks.make_task(config.env.task)
   agent, params, step = load_agent(run_dir, config, task, step=step)
   lstm_instants = config.agent.lstm_instants
-  shapes = contract.fields(
-    observation_shapes(config.env, task, lstm_instants=lstm_instants)
-  )
+  seen = observation_shapes(config.env, task, lstm_instants=lstm_instants)
+  shapes = seen.present()
   act = program.make_act(agent, params, acting=acting)
   exported = program.export(act, shapes)
   about = {

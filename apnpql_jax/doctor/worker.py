@@ -49,14 +49,14 @@ def examine(
     done = False
     try:
       while not done and ours.poll(timeout_s):
-        match ours.recv():
-          case list() as more:
-            found += more
-            tell(", ".join(x.name for x in more))
-          case "done":
-            done = True
-          case free:
-            pass
+        message = ours.recv()
+        if message == "done":
+          done = True
+        elif isinstance(message, list):
+          found += message
+          tell(", ".join(x.name for x in message))
+        else:
+          free = message
     except EOFError:
       process.join()
     if not done:

@@ -103,10 +103,9 @@ class FunctionalEnv:
 def _state(worlds: EnvState, rng: PRNGKeyArray, faults: Array | int = 0) -> State:
   """Returns the state after a step; ``faults`` are those before it, i32[worlds]."""
   timestep = worlds.timestep
-  fields = vars(worlds.observation).items()
   return State(
     pipeline_state=worlds,
-    obs={name: x for name, x in fields if x is not None},
+    obs=worlds.observation.present(),
     reward=timestep.reward,
     done=timestep.last.astype(jnp.float32),
     metrics={"success": timestep.terminated.astype(jnp.float32)},

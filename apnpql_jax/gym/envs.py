@@ -66,8 +66,8 @@ class Worlds:
     self._reset, self._step = jax.jit(self.env.reset), jax.jit(self._advance)
     self._merge, self._expert = jax.jit(_merged), jax.jit(self.env.expert_action)
     example = jax.eval_shape(self.env.reset, jnp.zeros(count, jnp.int32)).observation
-    shapes = {k: v for k, v in vars(example).items() if v is not None}
-    self.observation_space = spaces.Dict({k: _box(v) for k, v in shapes.items()})
+    boxes = {name: _box(x) for name, x in example.present().items()}
+    self.observation_space = spaces.Dict(boxes)
     self.action_space = spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
 
   @functools.cached_property

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from apnpql_jax.config.files import mjcf_path
+from apnpql_jax.sim.names import TOOL_SITE
 
 MAX_ITERATIONS = 60
 POSITION_TOLERANCE = 1e-3  # m; a target with a larger residual counts as unreachable
@@ -27,7 +28,7 @@ class IkSolver:
     model = mujoco.MjModel.from_xml_path(str(mjcf_path("robot")))
     self._configuration = mink.Configuration(model)
     self._pose = mink.FrameTask(
-      "tool", "site", position_cost=1.0, orientation_cost=1.0, lm_damping=1e-6
+      TOOL_SITE, "site", position_cost=1.0, orientation_cost=1.0, lm_damping=1e-6
     )
     self._posture = mink.PostureTask(model, cost=POSTURE_COST)
     self._limits = [mink.ConfigurationLimit(model)]

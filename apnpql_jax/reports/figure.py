@@ -6,10 +6,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+import numpy as np
+
 from apnpql_jax.atomic import replacing
 from apnpql_jax.reports import statistics
 from apnpql_jax.reports.groups import Group, tasks_of
 from apnpql_jax.reports.statistics import AXES, BANDS
+from apnpql_jax.runs.metrics import EPISODES, STEP, SUCCESS, WALL, Row
+from apnpql_jax.runs.success import interval_of_rate
 
 if TYPE_CHECKING:
   from matplotlib.axes import Axes
@@ -76,6 +80,34 @@ def save(
     legend.remove()
   with replacing(path) as part:
     figure.savefig(part, dpi=140)
+
+
+def plot_curve(rows: Sequence[Row], path: Path, *, title: str = "") -> None:
+  """Draws the success rate over environment steps and over wall-clock minutes.
+
+  The band is the 95 % interval, for rows that hold the number of episodes. Draws
+  nothing if no row is an evaluation.
+  """
+  rows = [row for row in rows if row.get(SUCCESS) is not None]
+  if not rows:
+    return
+  rates = [row[SUCCESS] or 0.0 for row in rows]
+  episodes = [row.get(EPISODES) or 0 for row in rows]
+  band = 100 * np.array([*map(interval_of_rate, rates, episodes)]).T
+  figure = _figure(9.0, 3.6)
+  axes = figure.subplots(1, 2, sharey=True)
+  steps = [row[STEP] or 0.0 for row in rows]
+  minutes = [(row.get(WALL) or 0.0) / 60 for row in rows]
+  axes[0].set(xlabel="environment steps", ylabel="success of held-out episodes, %")
+  axes[1].set(xlabel="wall-clock minutes")
+  for axis, x in zip(axes, (steps, minutes), strict=True):
+    axis.plot(x, [100 * rate for rate in rates], marker=".", color="C0")
+    axis.fill_between(x, *band, alpha=0.25, color="C0", linewidth=0)
+    axis.set(ylim=(-2, 102))
+    axis.grid(alpha=0.3)
+  figure.suptitle(title)
+  with replacing(path) as part:
+    figure.savefig(part, dpi=120)
 
 
 def save_panel(

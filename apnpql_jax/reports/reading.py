@@ -12,8 +12,10 @@ from typing import Any
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.console import print_line
 from apnpql_jax.errors import ConfigError, FileError, UserError
+from apnpql_jax.runs import provenance
 from apnpql_jax.runs.metrics import EPISODES, STEP, SUCCESS, WALL, Row, read_evaluations
 from apnpql_jax.runs.run_folder import CONFIG_FILE, load_run_config
+from apnpql_jax.runs.text import read_text
 
 EVALUATION_FILE = "evaluation.json"
 """What ``apnpql evaluate RUN --json`` printed, if it was put into the run folder."""
@@ -103,7 +105,7 @@ def read(folder: Path) -> Run:
     load_run_config(folder),
     evaluations,
     _final(folder / EVALUATION_FILE, evaluations),
-    _versions(folder / "versions.json"),
+    _versions(folder / provenance.FILE),
     folder,
   )
 
@@ -146,9 +148,8 @@ def _json(path: Path) -> dict[str, Any] | None:
   if not path.is_file():
     return None
   try:
-    with path.open("rb") as file:
-      if not (text := file.read(_MAX_BYTES)):
-        return None
+    if not (text := read_text(path, _MAX_BYTES)):
+      return None
     data = json.loads(text)
   except (OSError, ValueError, RecursionError) as error:
     raise FileError(f"{path} cannot be read: {error}") from None

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 import numpy as np
 
 from apnpql_jax.reports.reading import Run
-from apnpql_jax.runs.metrics import wilson_interval
+from apnpql_jax.runs.success import interval_of_rate
 
 BANDS = {
   "interval": "95 % interval, the wider of t over seeds and Wilson over all episodes",
@@ -113,7 +113,7 @@ def interval(
   """
   mean = rates.mean(0)
   pairs = zip(mean, episodes, strict=True)
-  bounds = [_wilson(float(rate), round(float(number))) for rate, number in pairs]
+  bounds = [interval_of_rate(float(rate), round(number)) for rate, number in pairs]
   low, high = np.reshape(bounds, (-1, 2)).T
   if len(rates) == 1:
     return low, high
@@ -125,10 +125,3 @@ def interval(
     np.minimum(low, np.clip(mean - half, 0.0, 1.0)),
     np.maximum(high, np.clip(mean + half, 0.0, 1.0)),
   )
-
-
-def _wilson(rate: float, episodes: int) -> tuple[float, float]:
-  """Returns the interval of a rate; the rate itself if nobody counted the episodes."""
-  if not episodes:
-    return rate, rate
-  return wilson_interval(round(rate * episodes), int(episodes))

@@ -12,9 +12,7 @@ import mujoco
 import numpy as np
 
 from apnpql_jax.config import files
-
-JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-TOOL, FLANGE, BASE = "tool", "attachment_site", "base_frame"
+from apnpql_jax.sim.names import ARM_JOINTS, BASE_SITE, FLANGE_SITE, TOOL_SITE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,16 +30,16 @@ class ArmModel:
 
   def __init__(self) -> None:
     spec = mujoco.MjSpec.from_string(files.mjcf_files()["robot.xml"].decode())
-    for item in (*spec.equalities, *spec.actuators[len(JOINTS) :]):
+    for item in (*spec.equalities, *spec.actuators[len(ARM_JOINTS) :]):
       spec.delete(item)
-    for joint in spec.joints[len(JOINTS) :]:
+    for joint in spec.joints[len(ARM_JOINTS) :]:
       spec.delete(joint)
     self.model = spec.compile()
     self.torque_limit = self.model.actuator_ctrlrange[:, 1].copy()
     self.joint_range = self.model.jnt_range.copy()  # f64[6, 2], rad
     self._data = mujoco.MjData(self.model)
     self._tool, self._flange, base = (
-      self.model.site(name).id for name in (TOOL, FLANGE, BASE)
+      self.model.site(name).id for name in (TOOL_SITE, FLANGE_SITE, BASE_SITE)
     )
     mujoco.mj_kinematics(self.model, self._data)
     self.base_mat = self._data.site_xmat[base].reshape(3, 3).copy()

@@ -209,5 +209,9 @@ def _let_go(
 
 
 def _bytes(line: str, size: int) -> bytes:
-  """Returns text for a field of ``size`` bytes, cut between two characters."""
-  return line.encode()[:size].decode(errors="ignore").encode()
+  """Returns text for a field of ``size`` bytes; a longer one ends in an ellipsis."""
+  data = line.encode(errors="replace")  # Names of files may have lone surrogates.
+  if len(data) <= size:
+    return data
+  end = "…".encode()
+  return data[: size - len(end)].decode(errors="ignore").encode() + end

@@ -16,12 +16,13 @@ from multiprocessing.connection import Connection
 import select
 import sys
 
-from apnpql_jax.robot import devices, priority
+from apnpql_jax.errors import reason
+from apnpql_jax.robot import devices, interrupts, priority
 from apnpql_jax.robot.blackboard import Blackboard, Phase
 from apnpql_jax.robot.clock import Clock
 from apnpql_jax.robot.control import Control
 from apnpql_jax.robot.core import Core
-from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.hand import Hand
 from apnpql_jax.robot.limits import TIMESTEP
 
@@ -42,7 +43,7 @@ def main(
     peer: Pipe from the policy process, which alone holds the other end and may send
       why it ends.
   """
-  devices.leave_interrupts_to_the_main_process()
+  interrupts.leave_to_the_main_process()
   # More often than every 5 ms, so that the drivers' threads do not hold up cycles.
   sys.setswitchinterval(5e-4)
   board = Blackboard(board_name)
@@ -70,7 +71,7 @@ def main(
         control.close()
   except Exception as error:  # Whatever a driver raises ends the session with a line.
     with contextlib.suppress(OSError):
-      events.send(devices.reason(error))
+      events.send(reason(error))
   finally:
     board.close()
 

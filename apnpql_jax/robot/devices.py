@@ -1,4 +1,4 @@
-"""The devices of a robot by its name, opened where they are used.
+"""The devices of a robot, opened where they are used.
 
 Drivers are imported in the functions, because each needs packages of its vendor.
 """
@@ -7,48 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Generator, Sequence
 import contextlib
-import dataclasses
 import importlib
-import signal
 from typing import Any
 
-from apnpql_jax.errors import ConfigError, UserError, one_line
-from apnpql_jax.robot.cell import Cell
-from apnpql_jax.robot.clock import Clock
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.protocols import CAMERAS, Arm, Camera, Device, Gripper, Judge
-
-ROBOTS = ("ur5e", "simulated", "double")
-
-INTERRUPTS = (
-  *(signal.SIGINT, signal.SIGTERM, signal.SIGHUP),
-  *(signal.SIGQUIT, signal.SIGTSTP),  # Ctrl-\ and Ctrl-Z.
-)
-"""Signals that a terminal or an operator sends to all processes at once."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Robot:
-  """Description of the robot to open, which is sent to other processes."""
-
-  kind: str
-  """One of ``ROBOTS``."""
-
-  contract: dict[str, Any]
-  """The contract of the policy."""
-
-  cell: Cell
-  """The cell, with addresses and limits."""
-
-  clock: Clock = Clock()
-  """The clock of the session."""
-
-  plant: str = ""
-  """Name of the shared memory of a simulated plant."""
-
-  @property
-  def can_judge(self) -> bool:
-    """Whether it shows that the task is solved; no sensor of a real arm does."""
-    return self.kind == "simulated"
 
 
 def make_arm(robot: Robot, *, reads: bool = False) -> Any:
@@ -153,22 +116,3 @@ def calibrated_modes(robot: Robot) -> dict[str, Any]:
     for name, camera in found.cameras.items()
     if camera.about.get("lens_from") == "views"
   }
-
-
-def leave_interrupts_to_the_main_process() -> None:
-  """Ignores ``INTERRUPTS``: the main process brakes first."""
-  for number in INTERRUPTS:
-    signal.signal(number, signal.SIG_IGN)
-
-
-def check_kind(kind: str) -> None:
-  """Raises ``ConfigError`` unless there is such a robot."""
-  if kind not in ROBOTS:
-    raise ConfigError(f"unknown --robot {kind!r}; choose from {', '.join(ROBOTS)}")
-
-
-def reason(error: BaseException) -> str:
-  """Returns an error as one line; with its type unless it is for the user."""
-  if isinstance(error, UserError):
-    return one_line(error)
-  return f"{type(error).__name__}: {one_line(error)}"

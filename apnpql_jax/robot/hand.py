@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from apnpql_jax.robot import devices
+from apnpql_jax.errors import reason
 from apnpql_jax.robot.protocols import Gripper
 
 THERE_RAD = 0.05
@@ -72,5 +72,5 @@ class Hand:
     try:
       return call(*args)
     except Exception as error:  # Whatever the driver raises stops the motion.
-      line = devices.reason(error).removeprefix("gripper: ")
+      line = reason(error).removeprefix("gripper: ")
       self.error = self.error or f"gripper: {line}"

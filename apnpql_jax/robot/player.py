@@ -12,7 +12,7 @@ import numpy as np
 
 from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.blackboard import Blackboard, Phase
-from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.protocols import Camera, Frame, Judge
 from apnpql_jax.robot.recorder import Recorder
 

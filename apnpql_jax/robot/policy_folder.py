@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from apnpql_jax.errors import ConfigError, FileError, one_line
-from apnpql_jax.robot.arm_model import JOINTS, ArmModel
+from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.sim import motors
+from apnpql_jax.sim.names import ARM_JOINTS
 
 CONTRACT = "contract.json"
 VERSION = 1
@@ -44,14 +45,14 @@ class PolicyFolder:
   @property
   def neutral(self) -> np.ndarray:
     """Joint angles at which episodes begin, f64[6]."""
-    return np.array(self.contract["joints"]["neutral"][: len(JOINTS)], float)
+    return np.array(self.contract["joints"]["neutral"][: len(ARM_JOINTS)], float)
 
   @property
   def begins_closed(self) -> bool:
     """Whether the gripper is closed when an episode begins."""
     gripper = self.contract["joints"]["gripper"]
     middle = (gripper["open_rad"] + gripper["closed_rad"]) / 2
-    return self.contract["joints"]["neutral"][len(JOINTS)] > middle
+    return self.contract["joints"]["neutral"][len(ARM_JOINTS)] > middle
 
 
 def load(path: Path) -> PolicyFolder:
@@ -124,7 +125,7 @@ def _check(folder: PolicyFolder) -> None:
 def _check_arm(folder: PolicyFolder) -> None:
   """Checks joints, geometry and motor model."""
   contract, model = folder.contract, ArmModel()
-  if tuple(contract["joints"]["state"][:6]) != JOINTS:
+  if tuple(contract["joints"]["state"][:6]) != ARM_JOINTS:
     raise ConfigError(f"the policy in {folder.path} is for an arm with other joints")
   if contract["joints"].get("ranges", [])[:6] != model.joint_range.tolist():
     raise ConfigError(

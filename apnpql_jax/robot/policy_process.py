@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from apnpql_jax.errors import FileError, one_line
-from apnpql_jax.robot import devices, policy_folder
+from apnpql_jax.errors import FileError, one_line, reason
+from apnpql_jax.robot import devices, interrupts, policy_folder
 from apnpql_jax.robot.blackboard import Blackboard, Phase, text
-from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.orders import comes_true
 from apnpql_jax.robot.player import Act, Player
@@ -81,7 +81,7 @@ def main(
     peer: Pipe to the control process, which alone holds the other end. If that process
       ends, so does this one. Gets the error that ends this process, as text.
   """
-  devices.leave_interrupts_to_the_main_process()
+  interrupts.leave_to_the_main_process()
   ready, ending = threading.Event(), threading.Event()
   args = peer, ready, ending
   threading.Thread(target=_end_with, args=args, daemon=True).start()
@@ -89,7 +89,7 @@ def main(
 
   def tell(error: Exception) -> None:
     """Ends the motion and the session, with one line for the user."""
-    line = devices.reason(error)
+    line = reason(error)
     if not text(board["policy"].read()["error"]):
       board["policy"].write({"error": line})
     with contextlib.suppress(OSError):

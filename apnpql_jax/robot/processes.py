@@ -9,7 +9,7 @@ import os
 from typing import Any
 
 from apnpql_jax.robot import control_process, policy_process
-from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.description import Robot
 
 
 class Processes:

@@ -26,12 +26,13 @@ from apnpql_jax.errors import (
   one_line,
 )
 from apnpql_jax.robot import replay
-from apnpql_jax.robot.devices import INTERRUPTS, Robot
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.episodes import Homing, Options, Outcome
+from apnpql_jax.robot.interrupts import INTERRUPTS
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.session import Session
 from apnpql_jax.robot.supervisor import NO_ACTION
-from apnpql_jax.runs.metrics import wilson_interval
+from apnpql_jax.runs.success import success_figures
 
 EVENTS = "episodes.jsonl"
 """File in the folder of a log: an episode per line, with each change of the mode."""
@@ -190,12 +191,7 @@ def _summary(
   }
   judged = [x.solved for x in outcomes if x.solved is not None]
   if judged:
-    solved = sum(judged)
-    found |= {
-      "successes": solved,
-      "success_rate": solved / len(judged),
-      "ci95": wilson_interval(solved, len(judged)),
-    }
+    found |= success_figures(sum(judged), len(judged))
   found |= _at_home([x.homing_after for x in outcomes if x.homing_after is not None])
   if options.log is not None and outcomes:
     found["log"] = options.log

@@ -14,7 +14,7 @@ import numpy as np
 from apnpql_jax.errors import INTERRUPTED, DeviceError, RunStopped
 from apnpql_jax.robot import policy_process
 from apnpql_jax.robot.blackboard import PERIOD_BIN_S, Blackboard, Phase, text
-from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.episodes import SOLVED, TIME_LIMIT, Homing, Options, Outcome
 from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.orders import Orders, comes_true

@@ -13,7 +13,7 @@ from apnpql_jax.robot import devices
 from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.cell import Cell, load_cell
 from apnpql_jax.robot.clock import Clock
-from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.limits import MotionLimiter
 from apnpql_jax.robot.policy_folder import PolicyFolder
 
@@ -36,7 +36,7 @@ def describe(
   """Returns the robot of a command.
 
   Args:
-    kind: One of ``devices.ROBOTS``.
+    kind: One of ``description.ROBOTS``.
     policy: The policy to run.
     path: File of the cell, for a real arm.
     slowdown: That of a simulated robot's clock.

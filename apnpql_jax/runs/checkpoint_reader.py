@@ -19,7 +19,13 @@ from apnpql_jax.config.files import config_from_json
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.errors import FileError, UserError, one_line
 from apnpql_jax.runs import checkpoint_record, leaves, segments
-from apnpql_jax.runs.checkpoint_record import DamagedError, best, newest_until, title
+from apnpql_jax.runs.checkpoint_record import (
+  DamagedError,
+  Record,
+  best,
+  newest_until,
+  title,
+)
 from apnpql_jax.runs.segments import Segment
 
 all_steps = checkpoint_record.steps
@@ -29,6 +35,7 @@ class Restored(NamedTuple):
   """Result of ``restore``."""
 
   step: int
+  record: Record  # of the checkpoint
   items: dict[str, Any]  # item -> pytree, as requested
   steps: dict[str, int]  # item -> step of the checkpoint it is from, at most ``step``
   damaged: list[str]  # a line for each newer checkpoint that could not be used
@@ -96,8 +103,8 @@ def restore(
     while left := [x for x in _candidates(run_dir, step) if x not in tried]:
       tried.add(left[0])
       try:
-        lost: list[Segment] | None = [] if tolerant else None
-        found = _restore(run_dir, left[0], examples, config, partly, lost)
+        reader = _Reader(run_dir, left[0], partly=partly, tolerant=tolerant)
+        found = reader.restore(examples, config)
         newer = [line for other, line in damaged.items() if other > left[0]]
         return found._replace(damaged=newer)
       except DamagedError as error:
@@ -112,27 +119,95 @@ def restore(
   return found
 
 
-def _restore(
-  run_dir: Path,
-  step: int,
-  examples: Mapping[str, Any] | Callable[[Any], Mapping[str, Any]],
-  config: TrainConfig | None,
-  partly: bool,
-  lost: list[Segment] | None,
-) -> Restored:
-  """Restores a checkpoint; adds unreadable segments to ``lost`` unless it is None."""
-  record = checkpoint_record.read(run_dir, step)
-  saved = config and _config(title(run_dir, step), record.config, config)
-  wanted = examples if isinstance(examples, Mapping) else examples(saved)
-  steps = {
-    name: step if name in record.items else _step_with(run_dir, step, name)
-    for name in wanted
-  }
-  items = {
-    name: _restore_item(run_dir, steps[name], name, example, partly, lost)
-    for name, example in wanted.items()
-  }
-  return Restored(step, items, steps, [], lost or [])
+class _Reader:
+  """Reader of one checkpoint; raises ``DamagedError`` for what it cannot read.
+
+  If ``tolerant``, it collects segments that it cannot read instead.
+  """
+
+  def __init__(self, run_dir: Path, step: int, *, partly: bool, tolerant: bool):
+    self._run_dir, self._step = run_dir, step
+    self._partly, self._tolerant = partly, tolerant
+    self._lost: list[Segment] = []
+
+  def restore(
+    self,
+    examples: Mapping[str, Any] | Callable[[Any], Mapping[str, Any]],
+    config: TrainConfig | None,
+  ) -> Restored:
+    """Returns the items; the arguments are those of the function ``restore``."""
+    step, record = self._step, checkpoint_record.read(self._run_dir, self._step)
+    saved = config and _config(title(self._run_dir, step), record.config, config)
+    wanted = examples if isinstance(examples, Mapping) else examples(saved)
+    steps = {
+      name: step if name in record.items else _step_with(self._run_dir, step, name)
+      for name in wanted
+    }
+    items = {
+      name: self._item(name, steps[name], example) for name, example in wanted.items()
+    }
+    return Restored(step, record, items, steps, [], self._lost)
+
+  def _item(self, item: str, step: int, example: Any) -> Any:
+    """Returns an item from the checkpoint ``step``, which holds it."""
+    name = title(self._run_dir, step)
+    record = checkpoint_record.read(self._run_dir, step)
+    saved = record.items[item]
+    wanted = {path: leaves.kind(leaf) for path, leaf in leaves.named(example).items()}
+    if self._partly:
+      saved = {path: saved[path] for path in wanted if path in saved}
+    for path in sorted(saved.keys() | wanted.keys()):
+      held = saved[path].kind if path in saved else "nothing"
+      expected = wanted.get(path, "nothing")
+      if held != expected:
+        raise FileError(f"{name} holds {held} at {path}, where {expected} is expected")
+    apart = {path for path, leaf in saved.items() if leaf.crc32 is None}
+    folder = checkpoint_record.folder(self._run_dir) / str(step) / item
+    crc32s = {path: leaf.crc32 for path, leaf in saved.items()}
+    tree = _read(folder, leaves.without(example, apart), crc32s, name, self._partly)
+    impls = {path: leaf.key_impl for path, leaf in saved.items() if leaf.key_impl}
+    try:
+      tree = leaves.to_typed(tree, impls, example)  # With zeros for arrays apart.
+    except (TypeError, ValueError) as error:
+      raise DamagedError(f"{name} cannot be read: {one_line(error)}") from None
+    arrays = leaves.named(tree)
+    rings = {f"{item}/{path}": arrays.pop(path) for path in apart}
+    del tree  # The rings are donated.
+    rings = self._filled(rings, record.segments, name)
+    arrays |= {path: rings[f"{item}/{path}"] for path in apart}
+    return leaves.fill(example, arrays)
+
+  def _filled(
+    self, rings: dict[str, Any], held: Sequence[Segment], name: str
+  ) -> dict[str, Any]:
+    """Returns the rings with their segments written into them, in place."""
+    found = set()
+    for segment in held:
+      paths = segment.crc32s.keys()
+      if not paths & rings.keys():
+        continue
+      rows = segment.stop - segment.start
+      if not paths <= rings.keys() or segment.stop > min(len(rings[x]) for x in paths):
+        raise DamagedError(f"{name} cannot be read: a segment is not within its ring")
+      found |= paths
+      shapes = {
+        path: jax.ShapeDtypeStruct((rows, *x.shape[1:]), x.dtype, sharding=x.sharding)
+        for path, x in rings.items()
+        if path in paths
+      }
+      folder = segments.folder(self._run_dir) / str(segment.number)
+      try:
+        part = _read(folder, segments.to_tree(shapes), segment.crc32s, name)
+      except DamagedError:
+        if not self._tolerant:
+          raise
+        self._lost.append(segment)
+        continue
+      target = {path: rings.pop(path) for path in paths}
+      rings |= segments.put(target, leaves.named(part), segment.start)
+    if missing := rings.keys() - found:
+      raise DamagedError(f"{name} cannot be read: no segment holds {min(missing)}")
+    return rings
 
 
 def _candidates(run_dir: Path, step: int | None) -> list[int]:
@@ -167,82 +242,6 @@ def _step_with(run_dir: Path, last: int, item: str) -> int:
     name = title(run_dir, last)
     raise DamagedError(f"neither {name} nor an earlier checkpoint has the {item}")
   return step
-
-
-def _restore_item(
-  run_dir: Path,
-  step: int,
-  item: str,
-  example: Any,
-  partly: bool,
-  lost: list[Segment] | None,
-) -> Any:
-  name = title(run_dir, step)
-  record = checkpoint_record.read(run_dir, step)
-  saved = record.items[item]
-  if partly:
-    saved = {path: saved[path] for path in leaves.named(example) if path in saved}
-  wanted = {path: leaves.kind(leaf) for path, leaf in leaves.named(example).items()}
-  for path in sorted(saved.keys() | wanted.keys()):
-    held = saved[path].kind if path in saved else "nothing"
-    expected = wanted.get(path, "nothing")
-    if held != expected:
-      raise FileError(f"{name} holds {held} at {path}, where {expected} is expected")
-  apart = {path for path, leaf in saved.items() if leaf.crc32 is None}
-  folder = checkpoint_record.folder(run_dir) / str(step) / item
-  crc32s = {path: leaf.crc32 for path, leaf in saved.items()}
-  tree = _read(folder, leaves.without(example, apart), crc32s, name, partly)
-  impls = {path: leaf.key_impl for path, leaf in saved.items() if leaf.key_impl}
-  try:
-    tree = leaves.to_typed(tree, impls, example)  # With zeros for arrays apart.
-  except (TypeError, ValueError) as error:
-    raise DamagedError(f"{name} cannot be read: {one_line(error)}") from None
-  arrays = leaves.named(tree)
-  rings = {f"{item}/{path}": arrays.pop(path) for path in apart}
-  del tree  # The rings are donated.
-  rings = _fill(run_dir, rings, record.segments, name, lost)
-  arrays |= {path: rings[f"{item}/{path}"] for path in apart}
-  return leaves.fill(example, arrays)
-
-
-def _fill(
-  run_dir: Path,
-  rings: dict[str, Any],
-  held: Sequence[Segment],
-  name: str,
-  lost: list[Segment] | None,
-) -> dict[str, Any]:
-  """Returns the rings with their segments written into them, in place.
-
-  Adds those that cannot be read to ``lost``; raises ``DamagedError`` if it is None.
-  """
-  found = set()
-  for segment in held:
-    paths = segment.crc32s.keys()
-    if not paths & rings.keys():
-      continue
-    rows = segment.stop - segment.start
-    if not paths <= rings.keys() or segment.stop > min(len(rings[x]) for x in paths):
-      raise DamagedError(f"{name} cannot be read: a segment is not within its ring")
-    found |= paths
-    shapes = {
-      path: jax.ShapeDtypeStruct((rows, *x.shape[1:]), x.dtype, sharding=x.sharding)
-      for path, x in rings.items()
-      if path in paths
-    }
-    folder = segments.folder(run_dir) / str(segment.number)
-    try:
-      part = _read(folder, segments.to_tree(shapes), segment.crc32s, name)
-    except DamagedError:
-      if lost is None:
-        raise
-      lost.append(segment)
-      continue
-    target = {path: rings.pop(path) for path in paths}
-    rings |= segments.put(target, leaves.named(part), segment.start)
-  if missing := rings.keys() - found:
-    raise DamagedError(f"{name} cannot be read: no segment holds {min(missing)}")
-  return rings
 
 
 def _read(

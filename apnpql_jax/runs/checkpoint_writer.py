@@ -166,7 +166,7 @@ class CheckpointWriter:
         commit, self._commit = self._commit, None
         commit()
     except Exception as error:
-      raise self._failed(error) from error
+      raise _save_error(self._delete_failed(), error) from error
 
   def wait(self) -> None:
     """Waits until everything saved is on disk.
@@ -178,7 +178,7 @@ class CheckpointWriter:
     try:
       self._manager.wait_until_finished()
     except Exception as error:
-      raise self._failed(error) from error
+      raise _save_error(self._delete_failed(), error) from error
     if self._saving:
       self._saving = None
       self._delete_unused()
@@ -208,17 +208,22 @@ class CheckpointWriter:
         self._saving = self._commit = None
       self.close()
 
-  def _failed(self, error: Exception) -> SaveError:
-    """Removes what a failed save left behind, which may fill the disk."""
+  def _delete_failed(self) -> int | None:
+    """Deletes a failed save, which may fill the disk; returns its step."""
     step, _ = self._saving or (None, 0.0)
     self._saving = self._commit = None
     for part in checkpoint_record.folder(self._run_dir).glob(f"{step}.*-tmp*"):
       shutil.rmtree(part, ignore_errors=True)
     self._delete_unused()
-    cause = one_line(error)
-    if "os_error_code" in str(error):  # Leave out the names of temporary files.
-      cause = " ".join(str(error).split()).rpartition(": ")[2]
-    return SaveError(f"checkpoint {step} could not be saved: {cause}")
+    return step
+
+
+def _save_error(step: int | None, cause: Exception) -> SaveError:
+  """Returns the error of a failed save; leaves out the names of temporary files."""
+  line = one_line(cause)
+  if "os_error_code" in str(cause):
+    line = " ".join(str(cause).split()).rpartition(": ")[2]
+  return SaveError(f"checkpoint {step} could not be saved: {line}")
 
 
 @jax.jit

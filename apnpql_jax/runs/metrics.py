@@ -1,4 +1,4 @@
-"""Metrics of a run: the rows of ``metrics.jsonl``, and the success curve."""
+"""Metrics of a run: the rows of ``metrics.jsonl``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import shutil
 import time
 from typing import Any, Protocol
 
-from apnpql_jax.atomic import replacing
 from apnpql_jax.console import print_line, reporting
 from apnpql_jax.errors import FileError, one_line
 from apnpql_jax.runs.text import write_text
@@ -24,24 +23,6 @@ MAX_BYTES = 32 << 20
 """Size above which ``metrics.jsonl`` is renamed to ``metrics.<n>.jsonl``."""
 
 Row = dict[str, float | None]
-
-
-def wilson_interval(successes: int, n: int) -> tuple[float, float]:
-  """Returns the 95 % score interval (Wilson, 1927) of a success rate.
-
-  Unlike the normal approximation, it stays within [0, 1] and does not shrink to a point
-  at 0 or ``n`` successes.
-  Zero episodes give (0, 1).
-
-  Raises:
-    ValueError: ``successes`` is not within [0, n].
-  """
-  if successes == n == 0:
-    return 0.0, 1.0
-  from scipy.stats import binomtest  # Here, because its import slows the start.
-
-  low, high = binomtest(successes, n).proportion_ci(method="wilson")
-  return float(low), float(high)
 
 
 class Sink(Protocol):
@@ -188,46 +169,6 @@ def read_rows(path: Path, *, having: str = "", skip_damaged: bool = False) -> li
         raise FileError(f"{path}, line {number}: not a row of metrics") from None
       rows.append(row)
   return rows
-
-
-def plot_curve(rows: Sequence[Row], path: Path, *, title: str = "") -> None:
-  """Draws the success rate over environment steps and over wall-clock minutes.
-
-  The band is the 95 % interval, for rows that hold the number of episodes. Draws
-  nothing if no row is an evaluation.
-  """
-  rows = [row for row in rows if row.get(SUCCESS) is not None]
-  if not rows:
-    return
-  # Not pyplot, which would choose a display for the whole process.
-  from matplotlib.backends.backend_agg import FigureCanvasAgg
-  from matplotlib.figure import Figure
-
-  percent = [100 * (row[SUCCESS] or 0.0) for row in rows]
-  low, high = zip(*map(_interval, rows), strict=True)
-  band = [[100 * bound for bound in bounds] for bounds in (low, high)]
-  figure = Figure(figsize=(9.0, 3.6), layout="constrained")
-  FigureCanvasAgg(figure)
-  axes = figure.subplots(1, 2, sharey=True)
-  steps = [row[STEP] or 0.0 for row in rows]
-  minutes = [(row.get(WALL) or 0.0) / 60 for row in rows]
-  axes[0].set(xlabel="environment steps", ylabel="success of held-out episodes, %")
-  axes[1].set(xlabel="wall-clock minutes")
-  for axis, x in zip(axes, (steps, minutes), strict=True):
-    axis.plot(x, percent, marker=".", color="C0")
-    axis.fill_between(x, *band, alpha=0.25, color="C0", linewidth=0)
-    axis.set(ylim=(-2, 102))
-    axis.grid(alpha=0.3)
-  figure.suptitle(title)
-  with replacing(path) as part:
-    figure.savefig(part, dpi=120)
-
-
-def _interval(row: Row) -> tuple[float, float]:
-  rate, episodes = row[SUCCESS] or 0.0, row.get(EPISODES)
-  if not episodes:
-    return rate, rate
-  return wilson_interval(round(rate * episodes), int(episodes))
 
 
 def _number(value: Any) -> float:

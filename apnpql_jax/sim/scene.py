@@ -21,12 +21,8 @@ from apnpql_jax.config import files
 from apnpql_jax.console import print_line
 from apnpql_jax.errors import ConfigError, one_line
 from apnpql_jax.sim import scene_checks
+from apnpql_jax.sim.names import ARM_JOINTS, GRIPPER_JOINT, TOOL_SITE
 from apnpql_jax.sim.quiet_mjx import mjx
-
-ARM_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-GRIPPER_JOINT = "finger_r1"
-TOOL_SITE = "tool"
-BASE_SITE = "base_frame"  # the frame of the arm's controller
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,7 +24,7 @@ from apnpql_jax.envs.env import HELD_OUT_SHARE, Env, make_env, observation_shape
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.primitives import reset_bank
 from apnpql_jax.runs import abandoned_tasks, checkpoint_reader, leaves, run_folder
-from apnpql_jax.runs.metrics import wilson_interval
+from apnpql_jax.runs.success import success_figures
 from apnpql_jax.tasks import Task, make_task
 from apnpql_jax.training.rollout import (
   Episodes,
@@ -78,12 +78,10 @@ def held_out_batches(
 
 def figures_of(played: Episodes) -> dict[str, Any]:
   """Returns counts, success rate, ci95 (Wilson) and mean length in control periods."""
-  episodes, successes = len(played.success), int(played.success.sum())
+  episodes = len(played.success)
   return {
     "episodes": episodes,
-    "successes": successes,
-    "success_rate": successes / episodes,
-    "ci95": wilson_interval(successes, episodes),
+    **success_figures(int(played.success.sum()), episodes),
     "mean_length": float(played.length.mean()),
   }
 

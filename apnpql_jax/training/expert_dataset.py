@@ -15,7 +15,7 @@ from apnpql_jax.data.demonstrations import Demonstrations
 from apnpql_jax.data.lerobot import conversion
 from apnpql_jax.envs.cameras import make_cameras
 from apnpql_jax.sim.kinematics import make_kinematics
-from apnpql_jax.sim.scene import ARM_JOINTS, GRIPPER_JOINT
+from apnpql_jax.sim.names import ARM_JOINTS, GRIPPER_JOINT
 from apnpql_jax.tasks.task import Task
 
 ROBOT = "ur5e_rh_p12_rn"

@@ -19,13 +19,7 @@ from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.data import npz
 from apnpql_jax.envs.env import observation_shapes
 from apnpql_jax.errors import ConfigError, FileError
-from apnpql_jax.runs import (
-  checkpoint_reader,
-  checkpoint_record,
-  leaves,
-  provenance,
-  run_folder,
-)
+from apnpql_jax.runs import checkpoint_reader, leaves, provenance, run_folder
 from apnpql_jax.runs.segments import to_tree
 from apnpql_jax.tasks import make_task
 from apnpql_jax.training.placement import shardings
@@ -51,8 +45,8 @@ class Weights(NamedTuple):
     np.savez(run_dir / FILE, **self.arrays)
 
 
-def find(origin: Path | str, config: TrainConfig) -> tuple[Path, int]:
-  """Returns the run and the step that ``RUN``, ``RUN:STEP`` or ``RUN:best`` names.
+def check(origin: Path | str, config: TrainConfig) -> None:
+  """Checks the weights that ``RUN``, ``RUN:STEP`` or ``RUN:best`` names.
 
   Raises:
     FileError: There is no such run or checkpoint.
@@ -60,8 +54,7 @@ def find(origin: Path | str, config: TrainConfig) -> tuple[Path, int]:
   """
   run_dir, step = _parse(origin)
   saved = run_folder.open_run(run_dir).config
-  step = checkpoint_reader.restore(run_dir, step, {}).step
-  learner = checkpoint_record.read(run_dir, step).items.get("learner", {})
+  learner = checkpoint_reader.restore(run_dir, step, {}).record.items.get("learner", {})
   held = {k: x.kind for k, x in learner.items() if k.split("/")[0] in _PARTS}
   wanted = _kinds(_example(config, None))
   if held != wanted:
@@ -69,15 +62,18 @@ def find(origin: Path | str, config: TrainConfig) -> tuple[Path, int]:
     diff = files.format_diff(changes.weights_diff(saved, config))
     diff = diff or f"{other} is {held.get(other)}, not {wanted.get(other)}"
     raise ConfigError(f"the weights of {str(run_dir)!r} do not fit: {diff}")
-  return run_dir, step
 
 
-def load(run_dir: Path, step: int, config: TrainConfig, mesh: Mesh | None) -> Weights:
-  """Reads the weights of a checkpoint.
+def load(origin: Path | str, config: TrainConfig, mesh: Mesh | None) -> Weights:
+  """Reads the weights of a checkpoint that ``check`` accepts.
+
+  It is the one that is the newest or the best now: a run that is training may have
+  replaced the one that was checked.
 
   Raises:
     FileError: They cannot be read.
   """
+  run_dir, step = _parse(origin)
   wanted = {"learner": to_tree(_example(config, mesh))}
   found = checkpoint_reader.restore(run_dir, step, wanted, partly=True)
   arrays = {k: np.asarray(x) for k, x in leaves.named(found.items["learner"]).items()}

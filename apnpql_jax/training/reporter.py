@@ -13,7 +13,8 @@ from apnpql_jax.agents.learner import Agent
 from apnpql_jax.config.schema import TrainConfig
 from apnpql_jax.console import reporting
 from apnpql_jax.envs.env import Env
-from apnpql_jax.runs.metrics import MetricWriter, plot_curve, read_evaluations
+from apnpql_jax.reports.figure import plot_curve
+from apnpql_jax.runs.metrics import MetricWriter, read_evaluations
 from apnpql_jax.runs.progress import TrainProgress
 from apnpql_jax.training.evaluate import figures_of, play_held_out
 from apnpql_jax.training.rollout import agent_policy, make_player

@@ -48,15 +48,14 @@ def prepare(
   config: TrainConfig,
   run_dir: Path,
   mesh: Mesh | None,
-  origin: tuple[Path, int] | None,
+  init_from: Path | str | None,
   *,
   resume: bool,
   overwrite: bool,
 ) -> Start:
   """Builds or restores everything; creates the run folder last.
 
-  Arguments and errors are those of ``train``; ``origin`` is the run and the step of the
-  weights to start with.
+  Arguments and errors are those of ``train``.
   """
   count = mesh.size if mesh else 1
   if resume:
@@ -67,8 +66,8 @@ def prepare(
       return _restored(config, run_dir, mesh)
   fill = _expert(config)
   weights = initial_weights.read(run_dir.absolute()) if resume else None
-  if origin:
-    weights = initial_weights.load(*origin, config, mesh)
+  if init_from is not None:
+    weights = initial_weights.load(init_from, config, mesh)
     about = weights.origin
     print_once(f"starting with the weights of {about['run']}, step {about['step']:,}")
   env, agent, iteration, _ = _build(config, run_dir, mesh, resumed=False)

@@ -69,9 +69,10 @@ def train(
   """
   run_dir = Path(run_dir)
   _check(config, run_dir, mesh, resume, overwrite, handle_signals)
-  if init_from is not None and resume:
-    raise ConfigError("a resumed run has weights; leave out init_from")
-  origin = None if init_from is None else initial_weights.find(init_from, config)
+  if init_from is not None:
+    if resume:
+      raise ConfigError("a resumed run has weights; leave out init_from")
+    initial_weights.check(init_from, config)
   hint = f"to continue: --resume {run_dir}"
   signals = Signals(
     f"stopped before the first iteration; {hint if resume else 'nothing is saved'}"
@@ -80,7 +81,9 @@ def train(
   with handled, abandoned_tasks.silenced():
     reserved = run_folder.reserve(run_dir) if devices.is_primary() else None
     with reserved or contextlib.nullcontext():
-      start = prepare(config, run_dir, mesh, origin, resume=resume, overwrite=overwrite)
+      start = prepare(
+        config, run_dir, mesh, init_from, resume=resume, overwrite=overwrite
+      )
     print_once(f"run folder {start.path}; compiling, which can take minutes")
     if (done := int(start.state.env_steps)) >= config.total_steps:
       print_once(f"nothing to train: step {done:,} of {config.total_steps:,} is done")

@@ -15,10 +15,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from apnpql_jax.robot.arm_model import FLANGE, ArmModel
+from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.virtual_arm import Admittance, VirtualArm
 from apnpql_jax.sim import motors
+from apnpql_jax.sim.names import FLANGE_SITE
 from apnpql_jax.sim.physics import OWN_FIELDS
 from apnpql_jax.sim.scene import Scene
 from apnpql_jax.transfer import bullet, friction, urdf
@@ -111,7 +112,7 @@ class BulletPlant:
     arm, finger = model.actuator_trnid[:6, 0], int(model.actuator_trnid[6, 0])
     self._arm = [bodies.joints[int(joint)] for joint in arm]
     self._limit = model.actuator_ctrlrange[:, 1]
-    self._flange_body = int(model.site(FLANGE).bodyid[0])
+    self._flange_body = int(model.site(FLANGE_SITE).bodyid[0])
     self._hand = {
       link
       for body, (loaded, link) in bodies.place.items()
@@ -157,7 +158,7 @@ class BulletPlant:
     See ``protocols.ArmState`` for its frame.
     """
     pos, mat = self.bodies.pose(self._flange_body)
-    flange = pos + mat @ self.bodies.model.site(FLANGE).pos
+    flange = pos + mat @ self.bodies.model.site(FLANGE_SITE).pos
     force, torque = np.zeros(3), np.zeros(3)
     # Of all pairs: asked for one body, PyBullet does not turn the friction with a pair.
     for contact in self._client.getContactPoints():

@@ -25,7 +25,7 @@ from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.envs.state import EnvState
 from apnpql_jax.errors import ConfigError, check_name
 from apnpql_jax.runs import run_folder
-from apnpql_jax.runs.metrics import wilson_interval
+from apnpql_jax.runs.success import success_figures
 from apnpql_jax.sim.physics import PhysicsState
 from apnpql_jax.tasks import make_task
 from apnpql_jax.training.diagnose import end_of
@@ -234,15 +234,12 @@ def _summary(
   """Returns the result; ``began`` is a monotonic time, s."""
   success = np.concatenate([x.success for x in played])
   stages = [stage for x in played for stage in x.stages]
-  episodes, solved = len(success), int(success.sum())
   failures = Counter(
     end_of(stages[i]) for i in np.flatnonzero(~success) if len(stages[i])
   )
   return {
     **identified,
-    "successes": solved,
-    "success_rate": solved / episodes,
-    "ci95": wilson_interval(solved, episodes),
+    **success_figures(int(success.sum()), len(success)),
     "mean_length": float(np.concatenate([x.length for x in played]).mean()),
     "failures": dict(failures),
     "failed_rows": np.concatenate([x.rows for x in played])[~success].tolist(),

@@ -58,8 +58,14 @@ class StripsPanel:
     self._axes, top = [], top + 18
     for strip in every:
       axis = self._sheet.place(left + 34, top, width - 34, strip.height * unit)
-      show = {"span_s": span_s, "bottom": strip is every[-1], "epsilon": self._epsilon}
-      strips.prepare(axis, strip, strip.limits(frames), **show)
+      strips.prepare(
+        axis,
+        strip,
+        strip.limits(frames),
+        span_s=span_s,
+        bottom=strip is every[-1],
+        epsilon=self._epsilon,
+      )
       self._axes.append((strip, axis))
       top += strip.height * unit + _GAP
     strips.legend(self._axes[0][1])

@@ -36,18 +36,26 @@ def strips_of(frame: Frame) -> list[Strip]:
   return [_PRIOR, _TILTED, _STAGE, *_FIGURES] if frame.guided else [_EXPERT, *_FIGURES]
 
 
-def prepare(axis: Axes, strip: Strip, limits: tuple[float, float], **show: Any) -> None:
+def prepare(
+  axis: Axes,
+  strip: Strip,
+  limits: tuple[float, float],
+  *,
+  span_s: float,
+  bottom: bool,
+  epsilon: float | None,
+) -> None:
   """Prepares the axes of a strip.
 
   Args:
     axis: Empty axes.
     strip: What they will show.
     limits: Lowest and highest value.
-    **show: ``span_s``, the time that is shown; ``bottom``, whether it is labeled; and
-      ``epsilon``, the limit of the KL divergence or None.
+    span_s: The time that is shown, s.
+    bottom: Whether the time is labeled.
+    epsilon: The limit of the KL divergence, if any.
   """
-  bottom, epsilon = show["bottom"], show["epsilon"]
-  axis.set(xlim=(0, show["span_s"]), ylim=limits)
+  axis.set(xlim=(0, span_s), ylim=limits)
   if strip in (_PRIOR, _TILTED):
     axis.set_yticks([0, 1])
   elif strip in (_STAGE, _EXPERT):

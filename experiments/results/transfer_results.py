@@ -9,7 +9,7 @@ from typing import Any
 
 from apnpql_jax.errors import FileError, one_line
 from apnpql_jax.reports.tables import listed, markdown
-from apnpql_jax.runs.metrics import wilson_interval
+from apnpql_jax.runs.success import wilson_interval
 
 HEAD = "run,task,trained,physics,renderer,looks,latency,admittance,solved,95%,failed in"
 """Columns of the table; trained: in plain or randomized worlds."""

@@ -27,7 +27,7 @@ from typing import Any
 from transfer_results import by_training, read, table
 
 from apnpql_jax.atomic import replacing
-from apnpql_jax.cli.commands import task_env
+from apnpql_jax.cli.inputs import task_env
 from apnpql_jax.errors import ConfigError, FileError, UserError
 from apnpql_jax.runs import checkpoint_reader, run_folder
 from apnpql_jax.transfer import identity

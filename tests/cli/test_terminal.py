@@ -11,10 +11,10 @@ import sys
 import pytest
 from terminals import read_all, terminal
 
-from apnpql_jax.cli import main, text
+from apnpql_jax.cli import commands, main, text
 
 ROOT = Path(__file__).resolve().parents[2]
-COMMANDS = sorted(main._COMMANDS)
+COMMANDS = sorted(commands.COMMANDS)
 ENV = os.environ | {"PYTHONPATH": str(ROOT), "TERM": "xterm-256color"}
 
 

@@ -22,8 +22,8 @@ from apnpql_jax.data import demonstrations, recordings
 from apnpql_jax.data.demonstrations import Demonstrations
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.errors import UserError
+from apnpql_jax.sim.names import ARM_JOINTS
 from apnpql_jax.sim.physics import START_TIME, Physics, PhysicsState
-from apnpql_jax.sim.scene import ARM_JOINTS
 from apnpql_jax.training import expert
 from apnpql_jax.training.rollout import expert_policy, make_player
 

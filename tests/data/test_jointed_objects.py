@@ -14,8 +14,9 @@ import pytest
 from apnpql_jax.data import demonstrations, recordings
 from apnpql_jax.errors import FileError
 from apnpql_jax.sim.engines import make_physics
+from apnpql_jax.sim.names import ARM_JOINTS
 from apnpql_jax.sim.physics import initial_state
-from apnpql_jax.sim.scene import ARM_JOINTS, Scene, load_scene
+from apnpql_jax.sim.scene import Scene, load_scene
 
 ARENA = Path(__file__).resolve().parents[2] / "mjcf" / "arena.xml"
 PERIOD_S, PERIODS = 0.15, 4

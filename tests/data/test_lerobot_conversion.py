@@ -16,7 +16,7 @@ from apnpql_jax.data.demonstrations import Demonstrations
 from apnpql_jax.data.lerobot import conversion
 from apnpql_jax.envs.env import Env, make_env
 from apnpql_jax.errors import UserError
-from apnpql_jax.sim.scene import ARM_JOINTS
+from apnpql_jax.sim.names import ARM_JOINTS
 from apnpql_jax.training import expert
 from apnpql_jax.training.expert_dataset import write_dataset
 

@@ -27,6 +27,7 @@ from apnpql_jax.deploy import contract, program
 from apnpql_jax.deploy.export import export
 from apnpql_jax.envs.env import observation_shapes
 from apnpql_jax.errors import FileError, UserError
+from apnpql_jax.sim.names import FLANGE_SITE
 from apnpql_jax.sim.scene import load_scene
 from apnpql_jax.tasks import make_task
 from apnpql_jax.training.train import train
@@ -97,7 +98,7 @@ def test_same_bits_in_a_process_without_the_package(
   instants = config.lstm_instants
   seen = observation_shapes(EnvConfig(), task, lstm_instants=instants)
   params = agent.init(jax.random.key(1), zeros(seen)).params
-  shapes = contract.fields(seen)
+  shapes = seen.present()
   made = program.export(program.make_act(agent, params, acting=acting), shapes)
   assert made.needs_key == needs_key
 
@@ -183,7 +184,7 @@ def test_a_program_that_calls_this_process_is_refused():
 def test_contract_projects_points_to_the_pixels_where_they_are_seen(camera):
   task, config = make_task("stack_box"), EnvConfig(task="stack_box")
   scene = task.scene
-  shapes = contract.fields(observation_shapes(config, task, lstm_instants=0))
+  shapes = observation_shapes(config, task, lstm_instants=0).present()
   about = contract.describe(config, scene, shapes, lstm_instants=0)
   data = mujoco.MjData(scene.model)
   data.qpos[:] = scene.keyframe("neutral")
@@ -200,7 +201,7 @@ def test_contract_projects_points_to_the_pixels_where_they_are_seen(camera):
   if camera == "global":
     position, turn = pose(seen["pose_in_world"])
   else:
-    flange = data.site(contract.FLANGE_SITE)
+    flange = data.site(FLANGE_SITE)
     mat, (position, turn) = flange.xmat.reshape(3, 3), pose(seen["pose_in_flange"])
     position, turn = flange.xpos + mat @ position, mat @ turn
   x, y, z = turn.T @ (data.geom_xpos[box] - position)

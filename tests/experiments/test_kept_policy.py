@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from apnpql_jax.config.files import load_preset
-from apnpql_jax.deploy.contract import fields
 from apnpql_jax.envs.env import make_env
 from apnpql_jax.envs.state import EnvState
 from apnpql_jax.robot import policy_folder
@@ -38,7 +37,7 @@ def test_the_kept_policy_puts_plates_into_boxes():
 
   def act(state: EnvState, seen: Observation, key: Array) -> Array:
     del state, key
-    given, unused = fields(seen), np.zeros(2, np.uint32)
+    given, unused = seen.present(), np.zeros(2, np.uint32)
     worlds = ({k: x[i : i + 1] for k, x in given.items()} for i in range(WORLDS))
     return jnp.concatenate([call(world, unused) for world in worlds])
 

@@ -11,6 +11,7 @@ import re
 import subprocess
 import sys
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 from run_files import EPISODES, make_run
@@ -19,7 +20,8 @@ from scipy import stats
 from apnpql_jax.atomic import replacing
 from apnpql_jax.errors import FileError, UserError
 from apnpql_jax.reports import figure, groups, page, reading, statistics, tables
-from apnpql_jax.runs.metrics import wilson_interval
+from apnpql_jax.runs import metrics
+from apnpql_jax.runs.success import wilson_interval
 
 
 @pytest.fixture
@@ -245,6 +247,33 @@ def test_a_legend_of_long_titles_is_inside(sweep, tmp_path, monkeypatch):
   (legend,) = made[0].legends
   inside = legend.get_window_extent()
   assert inside.x0 >= 0 and inside.x1 <= made[0].bbox.width
+
+
+def test_curve_shows_where_the_success_rate_is(tmp_path: Path):
+  path = tmp_path / "curve.png"
+  train_only: list[metrics.Row] = [{"step": 1, "loss": 2.0}]
+  figure.plot_curve(train_only, path)
+  assert not path.exists()
+
+  def drawn(rates: list[float]) -> np.ndarray:
+    rows: list[metrics.Row] = [
+      {"step": i, "time/wall_s": 60.0 * i, metrics.SUCCESS: r, metrics.EPISODES: 200}
+      for i, r in enumerate(rates)
+    ]
+    figure.plot_curve([*train_only, *rows], path, title="push_plate")
+    return iio.imread(path)[..., :3].astype(int)
+
+  high, low = drawn([0.9, 0.9, 0.9]), drawn([0.1, 0.1, 0.1])
+  assert high.shape == low.shape and high.shape[0] > 200
+  # Blue ink, the curve and its band, lies in the upper half or in the lower one.
+  heights = []
+  for image in (high, low):
+    ink = (image[..., 2] - image[..., 0]) > 60
+    left, right = np.split(ink, [ink.shape[1] // 2], axis=1)
+    assert left.any() and right.any()
+    heights.append(np.nonzero(ink)[0].mean() / ink.shape[0])
+  assert heights[0] < 0.35 and heights[1] > 0.6
+  assert [*tmp_path.iterdir()] == [path]
 
 
 def test_a_title_has_one_color_in_all_panels(sweep):

@@ -71,10 +71,20 @@ def test_text_is_shown_whatever_its_bytes():
   assert text(b"\xff\xc3") == "\ufffd\ufffd"
 
 
-def test_long_text_is_cut_between_characters():
+def test_text_is_written_whatever_its_characters():
+  _, writer, reader = pair()
+  writer.write({"reason": "a\udcff"})  # From the name of a file that is not UTF-8.
+  assert text(reader.read()["reason"]) == "a?"
+
+
+@pytest.mark.parametrize("before", range(4))
+def test_long_text_is_cut_between_characters_and_shows_it(before):
   with Blackboard() as board:
-    board["policy"].write({"error": "a" + 150 * "\u00e9"})
-    assert text(board["policy"].read()["error"]) == "a" + 99 * "\u00e9"
+    board["policy"].write({"error": before * "a" + 150 * "\u00e9"})
+    found = bytes(board["policy"].read()["error"]).decode()
+    assert found == before * "a" + (197 - before) // 2 * "\u00e9" + "\u2026"
+    board["policy"].write({"error": 100 * "\u00e9"})
+    assert text(board["policy"].read()["error"]) == 100 * "\u00e9"
     board["devices"].write({"arm": 4096 * "a"})
     assert text(board["devices"].read()["arm"]) == 4096 * "a"
 

@@ -16,6 +16,7 @@ from apnpql_jax.deploy.export import VERSION
 from apnpql_jax.errors import ConfigError, DeviceError, FileError
 from apnpql_jax.robot import cell, devices, policy_folder
 from apnpql_jax.robot.arm_model import ArmModel
+from apnpql_jax.robot.description import ROBOTS, Robot
 from apnpql_jax.robot.limits import MotionLimiter
 from apnpql_jax.testing import ROOT
 
@@ -204,7 +205,7 @@ def test_what_does_not_fit_the_cell_is_refused(exported, real_cell, capsys):
   assert "in the neutral pose of the policy the tool at" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("kind", devices.ROBOTS)
+@pytest.mark.parametrize("kind", ROBOTS)
 @pytest.mark.parametrize(
   ("keys", "value"), [(["task"], "stack_box"), (["origin"], {"scene_sha256": "0"})]
 )
@@ -231,7 +232,7 @@ def test_a_missing_package_names_the_extra(
 ):
   monkeypatch.setitem(sys.modules, module, None)
   contract = policy_folder.load(exported).contract
-  robot = devices.Robot(kind, contract, cell.Cell())
+  robot = Robot(kind, contract, cell.Cell())
   opened = devices.open_arm if kind == "ur5e" else devices.open_cameras
   with pytest.raises(DeviceError) as error, opened(robot):
     pass

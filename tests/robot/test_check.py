@@ -29,7 +29,7 @@ from apnpql_jax.robot.calibration.lenses import Lens
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.check import devices as check_devices, program
 from apnpql_jax.robot.check.command import check
-from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.doubles.server import ask
 from apnpql_jax.robot.drivers import realsense
 from apnpql_jax.robot.policy_folder import PolicyFolder

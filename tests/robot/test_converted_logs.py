@@ -30,7 +30,7 @@ from apnpql_jax.errors import FileError
 from apnpql_jax.robot.blackboard import Phase
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
-from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.player import Player
 from apnpql_jax.robot.recorder import Recorder
 from apnpql_jax.robot.simulated import cameras, devices

@@ -22,7 +22,7 @@ from rigs import NEUTRAL
 from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot.blackboard import Blackboard
 from apnpql_jax.robot.cell import Cell
-from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.episodes import Homing, Options
 from apnpql_jax.robot.hand import THERE_RAD
 from apnpql_jax.robot.policy_folder import PolicyFolder

@@ -19,7 +19,7 @@ from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot.blackboard import Blackboard, Phase
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
-from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.player import Player, next_period
 from apnpql_jax.robot.protocols import Frame
 from apnpql_jax.robot.recorder import Recorder

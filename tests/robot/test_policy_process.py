@@ -27,7 +27,7 @@ from apnpql_jax.robot import devices, policy_folder, policy_process
 from apnpql_jax.robot.blackboard import Blackboard, Phase, text
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
-from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.protocols import CAMERAS, Frame
 from apnpql_jax.robot.recorder import Recorder
 from apnpql_jax.robot.simulated import process as simulation

@@ -15,7 +15,7 @@ PROGRAM = """
 from multiprocessing import Pipe
 import os
 import threading
-from apnpql_jax.robot import control_process, devices
+from apnpql_jax.robot import control_process, description, devices
 from apnpql_jax.robot.blackboard import Blackboard
 from apnpql_jax.robot.cell import Cell
 
@@ -28,7 +28,7 @@ def open_arm(robot):
 
 devices.open_arm = open_arm
 contract = {"control_period_s": 0.15, "joints": {"ranges": [[-6.28, 6.28]] * 7}}
-robot = devices.Robot("ur5e", contract, Cell())
+robot = description.Robot("ur5e", contract, Cell())
 ours, theirs = Pipe()
 with Blackboard() as board:
   control_process.main(robot, board.name, {"admittance": False}, theirs, theirs)

@@ -24,7 +24,7 @@ from apnpql_jax.robot import control_process
 from apnpql_jax.robot.blackboard import Blackboard, Phase, text
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
-from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.simulated import devices as simulated, process as simulation
 from apnpql_jax.robot.supervisor import Mode
 

@@ -19,7 +19,7 @@ from apnpql_jax.robot import policy_folder, policy_process, session
 from apnpql_jax.robot.blackboard import Phase
 from apnpql_jax.robot.cell import Cell
 from apnpql_jax.robot.clock import Clock
-from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.episodes import Options
 from apnpql_jax.robot.run import EVENTS, run
 from apnpql_jax.robot.session import UNKNOWN, Session

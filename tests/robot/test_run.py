@@ -16,7 +16,7 @@ import pytest
 
 from apnpql_jax import testing
 from apnpql_jax.data import lerobot
-from apnpql_jax.robot.devices import INTERRUPTS
+from apnpql_jax.robot.interrupts import INTERRUPTS
 from apnpql_jax.robot.sensor import FREE_FORCE, load
 from apnpql_jax.testing import export_untrained
 

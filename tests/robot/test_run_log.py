@@ -16,7 +16,7 @@ from test_replayed_logs import CONTRACT
 from apnpql_jax.errors import DeviceError, FileError, RunStopped
 from apnpql_jax.robot import run
 from apnpql_jax.robot.cell import Cell
-from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.episodes import Homing, Options, Outcome
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.recorder import Recorder

@@ -1,4 +1,4 @@
-"""Metric files, the curve, the interval and the progress display."""
+"""Metric files and the progress display."""
 
 from __future__ import annotations
 
@@ -12,12 +12,9 @@ import sys
 import time
 from typing import Any
 
-from hypothesis import given, settings, strategies as st
-import imageio.v3 as iio
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import stats
 from tensorboardX.proto import event_pb2
 from terminals import read_all, terminal
 
@@ -43,36 +40,6 @@ class Clock:
 def _jsonl(folder: Path) -> list[dict[str, float]]:
   lines = (folder / "metrics.jsonl").read_text().splitlines()
   return [json.loads(line) for line in lines]
-
-
-@pytest.mark.parametrize(
-  ("successes", "n", "low", "high"),
-  [
-    (81, 263, 0.2553, 0.3662),
-    (15, 148, 0.0624, 0.1605),
-    (0, 20, 0.0, 0.1611),
-    (1, 29, 0.0061, 0.1718),
-  ],
-)
-def test_wilson_interval_equals_the_published_one(successes, n, low, high):
-  """Newcombe (1998), Statistics in Medicine 17, table I, method 3."""
-  got = metrics.wilson_interval(successes, n)
-  np.testing.assert_allclose(got, (low, high), atol=5e-5)
-
-
-@settings(max_examples=200, deadline=None)
-@given(st.integers(1, 2000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
-def test_wilson_interval_covers_the_rate(pair: tuple[int, int]):
-  successes, n = pair
-  low, high = metrics.wilson_interval(successes, n)
-  assert 0.0 <= low <= successes / n <= high <= 1.0 and low < high
-
-
-def test_wilson_interval_needs_successes_within_the_episodes():
-  assert metrics.wilson_interval(0, 0) == (0.0, 1.0)
-  for successes, n in ((-1, 5), (6, 5), (1, 0)):
-    with pytest.raises(ValueError, match="must"):
-      metrics.wilson_interval(successes, n)
 
 
 def test_rows_are_on_disk_at_once(tmp_path: Path):
@@ -269,40 +236,6 @@ def test_extras_that_are_unknown_or_missing_are_named(monkeypatch: pytest.Monkey
     with pytest.raises(UserError, match=rf"{package}, .*apnpql-jax\[{extra}\]"):
       check_sinks([name])
   check_sinks([])
-
-
-def test_curve_shows_where_the_success_rate_is(tmp_path: Path):
-  path = tmp_path / "curve.png"
-  train_only: list[metrics.Row] = [{"step": 1, "loss": 2.0}]
-  metrics.plot_curve(train_only, path)
-  assert not path.exists()
-
-  def drawn(rates: list[float]) -> np.ndarray:
-    rows: list[metrics.Row] = [
-      {"step": i, "time/wall_s": 60.0 * i, metrics.SUCCESS: r, metrics.EPISODES: 200}
-      for i, r in enumerate(rates)
-    ]
-    metrics.plot_curve([*train_only, *rows], path, title="push_plate")
-    return iio.imread(path)[..., :3].astype(int)
-
-  high, low = drawn([0.9, 0.9, 0.9]), drawn([0.1, 0.1, 0.1])
-  assert high.shape == low.shape and high.shape[0] > 200
-  # Blue ink, the curve and its band, lies in the upper half or in the lower one.
-  heights = []
-  for image in (high, low):
-    ink = (image[..., 2] - image[..., 0]) > 60
-    left, right = np.split(ink, [ink.shape[1] // 2], axis=1)
-    assert left.any() and right.any()
-    heights.append(np.nonzero(ink)[0].mean() / ink.shape[0])
-  assert heights[0] < 0.35 and heights[1] > 0.6
-  assert [*tmp_path.iterdir()] == [path]
-
-
-def test_the_curve_band_is_the_wilson_interval():
-  row: metrics.Row = {"step": 1, metrics.SUCCESS: 0.85, metrics.EPISODES: 40}
-  expected = stats.binomtest(34, 40).proportion_ci(method="wilson")
-  np.testing.assert_allclose(metrics._interval(row), expected, rtol=1e-9)
-  assert metrics._interval({"step": 1, metrics.SUCCESS: 0.85}) == (0.85, 0.85)
 
 
 def test_evaluations_are_read_again_if_the_run_renames_its_file(tmp_path, monkeypatch):

@@ -15,7 +15,8 @@ from apnpql_jax.runs.signals import Signals
 
 BUSY = """
 import hashlib, sys
-from apnpql_jax.cli import main, options
+from apnpql_jax.cli import main
+from apnpql_jax.cli.commands import COMMANDS, OPTIONS
 from apnpql_jax.runs.signals import Signals
 
 def busy(*_):
@@ -29,7 +30,7 @@ def train(*_):
     busy()
 
 command = busy if sys.argv[1] == "listing" else train
-main._COMMANDS["list"] = (options.List, command)
+COMMANDS["list"] = (OPTIONS["list"], command)
 main.main(["list"])
 """
 
@@ -126,12 +127,13 @@ def test_a_second_signal_does_not_wait_but_one_sent_twice_is_one():
 
 STOPPED = """
 from apnpql_jax import errors
-from apnpql_jax.cli import main, options
+from apnpql_jax.cli import main
+from apnpql_jax.cli.commands import COMMANDS, OPTIONS
 
 def stop(*_):
   raise errors.RunStopped("no space left", errors.FAILED)
 
-main._COMMANDS["list"] = (options.List, stop)
+COMMANDS["list"] = (OPTIONS["list"], stop)
 main.main(["list"])
 """
 

@@ -76,8 +76,8 @@ def test_the_weights_of_a_checkpoint_are_read(run, suffix, step):
   config = changed(PIXELS, "env", task="stack_box", worlds=4, randomize=True)
   agent = {"learning_rate_e": 1e-5, "decay_updates": 7, "policy_samples": 9}
   config = changed(config, "agent", **agent)
-  assert initial_weights.find(f"{run}{suffix}", config) == (run, step)
-  weights = initial_weights.load(run, step, config, None)
+  initial_weights.check(f"{run}{suffix}", config)
+  weights = initial_weights.load(f"{run}{suffix}", config, None)
   learner = learner_of(PIXELS, seed=step)
   expected = {"params": learner.params, "target_params": learner.target_params}
   flat = dict(paths_of(expected))
@@ -85,8 +85,28 @@ def test_the_weights_of_a_checkpoint_are_read(run, suffix, step):
   for path, array in weights.arrays.items():
     np.testing.assert_array_equal(array, flat[path])
   assert weights.origin["run"] == str(run) and weights.origin["step"] == step
-  other = initial_weights.load(run, step % 3 + 1, config, None)
+  other = initial_weights.load(f"{run}:{step % 3 + 1}", config, None)
   assert other.origin["sha256"] != weights.origin["sha256"]
+
+
+@pytest.mark.parametrize("suffix", ["", ":best", ":1"])
+def test_a_checkpoint_that_the_run_replaces_meanwhile_leads_to_the_newer_one(
+  tmp_path, suffix
+):
+  run = write_run(tmp_path / "run", PIXELS, first=0.5)
+  initial_weights.check(f"{run}{suffix}", PIXELS)
+  with CheckpointWriter(run, PIXELS, keep=1) as writer:
+    writer.save(2, {"learner": learner_of(PIXELS, seed=2)}, success_rate=0.75)
+  assert checkpoint_reader.all_steps(run) == [2]
+  if suffix == ":1":
+    with pytest.raises(FileError, match="has no checkpoint 1; choose from 2$"):
+      initial_weights.load(f"{run}{suffix}", PIXELS, None)
+    return
+  weights = initial_weights.load(f"{run}{suffix}", PIXELS, None)
+  assert weights.origin["step"] == 2
+  expected = learner_of(PIXELS, seed=2)
+  for path, leaf in paths_of({"params": expected.params}):
+    np.testing.assert_array_equal(weights.arrays[path], leaf)
 
 
 @pytest.mark.parametrize(
@@ -105,14 +125,14 @@ def test_the_weights_of_a_checkpoint_are_read(run, suffix, step):
 )
 def test_weights_that_do_not_fit_are_refused_by_setting(run, part, settings, words):
   with pytest.raises(ConfigError, match=words):
-    initial_weights.find(run, changed(PIXELS, part, **settings))
+    initial_weights.check(run, changed(PIXELS, part, **settings))
 
 
 def test_weights_of_another_task_with_other_points_are_refused(tmp_path):
   config = changed(PIXELS, "env", obs="state")
   run = write_run(tmp_path / "run", config, only=0.0)
   with pytest.raises(ConfigError, match="fit: env.task push_plate -> flip_cup$"):
-    initial_weights.find(run, changed(config, "env", task="flip_cup"))
+    initial_weights.check(run, changed(config, "env", task="flip_cup"))
 
 
 @pytest.mark.parametrize(
@@ -126,7 +146,7 @@ def test_weights_of_another_task_with_other_points_are_refused(tmp_path):
 )
 def test_an_origin_that_is_not_there_is_refused(run, origin, words):
   with pytest.raises(FileError, match=words):
-    initial_weights.find(origin.format(run), PIXELS)
+    initial_weights.check(origin.format(run), PIXELS)
 
 
 def test_settings_of_weights_are_all_that_change_their_shapes():

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 from apnpql_jax import testing
-from apnpql_jax.cli.options import Evaluate
+from apnpql_jax.cli.evaluate import Evaluate
 from apnpql_jax.config.ranges import (
   RandomizationConfig,
   check_sizes,

@@ -13,7 +13,8 @@ from apnpql_jax.data.demonstrations import Demonstrations
 from apnpql_jax.data.lerobot.layout import ENVIRONMENT, TIMES
 from apnpql_jax.data.lerobot.reader import Dataset, Episode, read
 from apnpql_jax.errors import FileError, UserError
-from apnpql_jax.sim.scene import ARM_JOINTS, GRIPPER_JOINT, Scene
+from apnpql_jax.sim.names import ARM_JOINTS, GRIPPER_JOINT
+from apnpql_jax.sim.scene import Scene
 
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 _TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")

@@ -11,7 +11,7 @@ from typing import Any
 from apnpql_jax.robot import policy_process, priority, setup
 from apnpql_jax.robot.check import devices, program
 from apnpql_jax.robot.check.table import Table
-from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.policy_folder import PolicyFolder
 from apnpql_jax.robot.simulated.devices import started
 

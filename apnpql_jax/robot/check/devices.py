@@ -18,7 +18,7 @@ from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot import devices
 from apnpql_jax.robot.arm_model import ArmModel
 from apnpql_jax.robot.check.table import Table
-from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.limits import TIMESTEP, Limits, MotionLimiter
 from apnpql_jax.robot.protocols import CAMERAS, ArmState, Frame
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from apnpql_jax.errors import DeviceError, one_line
 from apnpql_jax.robot.check.table import Table
-from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.player import Act, Observer
 from apnpql_jax.robot.protocols import Frame
 

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from apnpql_jax.robot.arm_model import JOINTS
 from apnpql_jax.robot.doubles.plant import World
 from apnpql_jax.robot.limits import TIMESTEP
+from apnpql_jax.sim.names import ARM_JOINTS
 
 VERSION = (5, 25, 1, 130182)
 SERIAL = "20265500000"
@@ -161,7 +161,7 @@ class Controller:
     if command == _NO_COMMAND:
       self._executing, self._answer = False, _READY
     elif command == _SERVO:
-      joints, (*_, lookahead, gain) = self._doubles(len(JOINTS)), self._doubles(11)
+      joints, (*_, lookahead, gain) = self._doubles(len(ARM_JOINTS)), self._doubles(11)
       self.plant.servo(np.array(joints), lookahead, gain)
       self._answer = _READY
     elif not self._executing:

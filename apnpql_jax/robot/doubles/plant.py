@@ -16,10 +16,10 @@ import mujoco
 import numpy as np
 
 from apnpql_jax.config import files
-from apnpql_jax.robot.arm_model import FLANGE
 from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.sensor import Sensor
 from apnpql_jax.robot.simulated.plant import Plant, Servo, moment
+from apnpql_jax.sim.names import FLANGE_SITE
 
 SPEED_LIMIT = math.pi  # rad/s, the UR5e's joints, data sheet
 DEVIATION_LIMIT = 0.15  # rad between target and joint, beyond which the arm stops
@@ -136,7 +136,7 @@ class World:
     """Returns the wrench of contacts and weight, without the payload's, f64[6]."""
     data, (payload, at) = self.data, self._payload
     mass, gravity = self.model.body_subtreemass[self._tool], self.model.opt.gravity
-    flange = data.site(FLANGE)
+    flange = data.site(FLANGE_SITE)
     lever = mass * (data.subtree_com[self._tool] - flange.xpos)
     lever -= payload * (flange.xmat.reshape(3, 3) @ at)
     weight = (mass - payload) * gravity, moment(lever, gravity)

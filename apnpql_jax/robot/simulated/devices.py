@@ -16,7 +16,7 @@ import numpy as np
 
 from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot.blackboard import Blackboard, text
-from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.orders import comes_true
 from apnpql_jax.robot.protocols import ArmState, GripperState
 from apnpql_jax.robot.simulated.process import CLOSE, HOLD, OPEN, RECORDS, main

@@ -13,11 +13,11 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from apnpql_jax.robot.arm_model import BASE, FLANGE, JOINTS
 from apnpql_jax.robot.limits import TIMESTEP
 from apnpql_jax.robot.protocols import ArmState
 from apnpql_jax.robot.sensor import Sensor
 from apnpql_jax.sim import motors
+from apnpql_jax.sim.names import ARM_JOINTS, BASE_SITE, FLANGE_SITE, GRIPPER_JOINT
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,13 +47,13 @@ class Plant:
     self.servo = Servo() if servo is None else servo
     self.model, self.data = model, mujoco.MjData(model)
     model.opt.timestep = TIMESTEP
-    joints = [model.joint(name) for name in JOINTS]
+    joints = [model.joint(name) for name in ARM_JOINTS]
     self._qpos = np.array([int(x.qposadr[0]) for x in joints])
     self._dof = np.array([int(x.dofadr[0]) for x in joints])
     model.dof_frictionloss[self._dof] = self.servo.friction_nm
-    finger = model.joint("finger_r1")
+    finger = model.joint(GRIPPER_JOINT)
     self._finger, self._finger_dof = int(finger.qposadr[0]), int(finger.dofadr[0])
-    self._limit = model.actuator_ctrlrange[: len(JOINTS), 1].copy()
+    self._limit = model.actuator_ctrlrange[: len(ARM_JOINTS), 1].copy()
     self._mass = np.zeros((model.nv, model.nv))
     self._block = np.ix_(self._dof, self._dof)
     self._gripper = model.body("gripper").id
@@ -115,8 +115,8 @@ class Plant:
     mujoco.mj_fullM(model, data, self._mass)
     wanted = gain**2 * (target - self.position) + 2 * gain * (velocity - self.velocity)
     torque = self._mass[self._block] @ wanted + data.qfrc_bias[self._dof]
-    data.ctrl[: len(JOINTS)] = torque.clip(-self._limit, self._limit)
-    data.ctrl[len(JOINTS)] = finger
+    data.ctrl[: len(ARM_JOINTS)] = torque.clip(-self._limit, self._limit)
+    data.ctrl[len(ARM_JOINTS)] = finger
     mujoco.mj_step(model, data)
 
   def arm_state(self, now: float) -> ArmState:
@@ -130,12 +130,12 @@ class Plant:
     mujoco.mj_rnePostConstraint(model, data)
     torque, force = data.cfrc_ext[self._hand].sum(0).reshape(2, 3)
     center = data.subtree_com[model.body_rootid[self._gripper]]
-    lever = center - data.site(FLANGE).xpos
+    lever = center - data.site(FLANGE_SITE).xpos
     return self.in_base(force, torque + moment(lever, force))
 
   def in_base(self, force: np.ndarray, torque: np.ndarray) -> np.ndarray:
     """Turns force and torque from world axes, f64[3] each, into those of the base."""
-    turn = self.data.site(BASE).xmat.reshape(3, 3).T
+    turn = self.data.site(BASE_SITE).xmat.reshape(3, 3).T
     return np.concatenate([turn @ force, turn @ torque])
 
   @property

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from apnpql_jax.robot import devices
+from apnpql_jax.errors import reason
+from apnpql_jax.robot import interrupts
 from apnpql_jax.robot.blackboard import TEXT, Blackboard
 from apnpql_jax.robot.clock import Clock
 from apnpql_jax.robot.limits import TIMESTEP
@@ -97,7 +98,7 @@ def main(name: str, task_name: str, options: dict[str, Any]) -> None:
     task_name: Name of the task.
     options: ``seed`` of the reset states, ``latency_s``, ``clock``.
   """
-  devices.leave_interrupts_to_the_main_process()
+  interrupts.leave_to_the_main_process()
   board = Blackboard(name, RECORDS)
   try:
     tasks = importlib.import_module("apnpql_jax.tasks")
@@ -108,7 +109,7 @@ def main(name: str, task_name: str, options: dict[str, Any]) -> None:
     _run(Simulation(board, plant, scene), options["clock"])
   except Exception as error:  # Shown by the main process, which ends the session.
     with contextlib.suppress(Exception):
-      board["plant"].write({"error": devices.reason(error)})
+      board["plant"].write({"error": reason(error)})
   finally:
     board.close()
 

@@ -31,6 +31,7 @@ from apnpql_jax.robot.calibration import command, files, limits, solve, views
 from apnpql_jax.robot.calibration.boards import Board
 from apnpql_jax.robot.calibration.problem import Problem, angle_deg
 from apnpql_jax.robot.cell import Cell
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.protocols import ArmState, Frame
 from apnpql_jax.sim.scene import load_scene
 
@@ -459,7 +460,7 @@ def test_the_command_calibrates_a_cell(contract, both, tmp_path, held):
   """Without devices; the lens that is the maker's is not that of another mode."""
   out = tmp_path / "calibration.json"
   serials = {name: f"serial of {name}" for name in contract["cameras"]}
-  robot = devices.Robot("ur5e", contract, Cell(calibration=out, cameras=serials))
+  robot = Robot("ur5e", contract, Cell(calibration=out, cameras=serials))
   args = cli.Robot(action="calibrate", robot="ur5e", views=both, recorded=True)
   result = cli._calibrate(args, robot)
   assert result["wrist"]["views"] >= 8 and result["global"]["views"] >= 8
@@ -471,7 +472,7 @@ def test_the_command_calibrates_a_cell(contract, both, tmp_path, held):
   (mode,) = devices.calibrated_modes(robot).values()
   assert mode["size"] == (HEIGHT, WIDTH) and mode["lens"]["fx"] > 0
   with pytest.raises(ConfigError, match="only the cameras of --robot ur5e"):
-    cli._calibrate(args, devices.Robot("simulated", contract, Cell()))
+    cli._calibrate(args, Robot("simulated", contract, Cell()))
 
 
 def test_the_command_prints_a_board(tmp_path, capfd):

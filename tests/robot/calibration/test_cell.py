@@ -14,7 +14,7 @@ from apnpql_jax.cli import robot as cli
 from apnpql_jax.errors import DeviceError
 from apnpql_jax.robot import doubles
 from apnpql_jax.robot.cell import Cell
-from apnpql_jax.robot.devices import Robot
+from apnpql_jax.robot.description import Robot
 from apnpql_jax.robot.doubles.server import ask
 from apnpql_jax.robot.drivers.ur_listener import Listener
 
