@@ -17,7 +17,7 @@ ROOT = testing.ROOT
 
 
 def blocks() -> dict[str, str]:
-  """File name -> content, from headings that name a file and the block after them."""
+  """Returns file name -> content, from headings with names and the blocks below."""
   text = (ROOT / "docs" / "add_a_task.md").read_text()
   found = re.findall(r"^## [^\n]*`(\S+)`$.*?^```\w+\n(.*?)^```$", text, re.M | re.S)
   return dict(found)

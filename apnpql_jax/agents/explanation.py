@@ -1,4 +1,4 @@
-"""What an agent considers at a state before it acts, for views and diagnoses."""
+"""Explanations of actions: what an agent considers at a state before it acts."""
 
 from __future__ import annotations
 

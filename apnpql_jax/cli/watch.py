@@ -107,7 +107,7 @@ def watch(args: Watch) -> dict[str, Any]:
 
 
 def _actor(args: Watch) -> Actor:
-  """Builds who acts."""
+  """Builds the actor."""
   from apnpql_jax.viewing import actors
 
   if args.task:

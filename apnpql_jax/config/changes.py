@@ -1,4 +1,4 @@
-"""Which settings a run may change: at a resume, or as a new run with its weights."""
+"""Settings that may change at a resume, or in a new run with the weights of another."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ def _installed() -> dict[str, metadata.EntryPoint]:
 def preset_tasks() -> list[str]:
   """Returns the sorted names of the tasks that have a preset of their own.
 
-  An installed package has it if entry points of its task and preset have one name.
+  An installed package has one if the entry points of its task and preset have one name.
   """
   installed = metadata.entry_points(group="apnpql.tasks").names
   tasks = {*_names("mjcf", ".xml"), *filter(is_name, installed)}

@@ -102,7 +102,7 @@ def check_free(folder: Path, *, overwrite: bool) -> None:
   """Checks that an export can be written to a folder.
 
   Raises:
-    FileError: It exists and is not to be replaced, or is no export, or cannot be made.
+    FileError: It exists and must not be replaced, is not an export, or cannot be made.
   """
   check_writable(folder)
   if not folder.exists():

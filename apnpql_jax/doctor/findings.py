@@ -10,7 +10,7 @@ from apnpql_jax.errors import one_line
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-  """What a check found."""
+  """Result of a check."""
 
   section: str
   """Part of the report."""

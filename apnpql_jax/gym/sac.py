@@ -40,7 +40,7 @@ def make_sac(
     task: Name of the task, or the path of its file.
     worlds: Worlds that one program steps.
     updates: Gradient steps after each step of the worlds.
-    seed: Of networks, actions and episodes.
+    seed: Random seed of networks, actions and episodes.
     options: Arguments of ``stable_baselines3.SAC`` that replace these, other than
       those of the replay.
   """

@@ -1,4 +1,4 @@
-"""Action primitives inside jit: update their joint targets and follow them.
+"""Action primitives inside jit: their joint targets, updated and followed.
 
 A primitive is the velocity from the present to a target configuration (paper
 Sec. IV-A). mink solves the targets of every reset state (``reset_bank``); from there a
@@ -40,7 +40,7 @@ def destination(
 ) -> Float[Array, "*b 6"]:
   """Returns the joint angles (rad) to which ``follow`` leads with these velocities.
 
-  The inverse of ``follow``. It stops at the distance from which the full speed is
+  This inverts ``follow``. It stops at the distance from which the full speed is
   reached, 0.7 rad, because a velocity does not tell how far beyond it the target is.
   """
   fastest = jnp.abs(velocity).max(-1, keepdims=True)

@@ -1,9 +1,9 @@
-"""Draws a separate world for every episode.
+"""The randomization of worlds: a separate one is drawn for every episode.
 
 The values go into ``PhysicsState.fields``, which both engines, the kinematics and the
-cameras read. They therefore cost no recompilation, and videos show them. The table
-stays in place and the robot stands lower or higher, tilted or turned on it, so that
-tasks can measure from the table.
+cameras read. So they need no recompilation, and videos show them. The table stays in
+place and the robot stands lower or higher, tilted or turned on it, so that tasks can
+measure from the table.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ REST_RAD_S = 0.01
 
 
 class Control:
-  """What the control process does, with the devices that it is given."""
+  """Control of the devices that it is given, cycle by cycle."""
 
   def __init__(
     self,
@@ -65,7 +65,7 @@ class Control:
 
   @property
   def phase(self) -> Phase:
-    """What it does."""
+    """The present phase."""
     return self._phase
 
   def end_motion(self, reason: str) -> None:
@@ -198,7 +198,7 @@ class Control:
         self._events.send((now, command.mode.name.lower(), command.reason))
 
   def _note_period(self, now: float) -> None:
-    """Counts the time since the last cycle, unless that has waited for the arm.
+    """Counts the time since the last cycle, unless that cycle has waited for the arm.
 
     After a long one, the arm is at rest at its last command, or nearly so. So the next
     command must not go on at the former speed.

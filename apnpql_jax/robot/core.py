@@ -36,7 +36,7 @@ class Command:
   """Whether the arm follows, holds or stops."""
 
   reason: str
-  """Why it does not follow."""
+  """Why the arm does not follow."""
 
   at_rest: bool
   """Whether the command stands still."""
@@ -61,7 +61,7 @@ class Core:
   def start(
     self, now: float, state: ArmState, target: np.ndarray | None = None
   ) -> None:
-    """Begins at the measured joint angles: an episode, or the way to a ``target``.
+    """Begins an episode, or the way to a ``target``, at the measured joint angles.
 
     The first cycle stops if the arm is outside of its limits, or the way leads out.
     """
@@ -88,8 +88,8 @@ class Core:
   def _gives_way(self, measured: np.ndarray, wrench: np.ndarray) -> bool:
     """Feels the wrench f64[6] in a hold; returns whether it moves the virtual arm.
 
-    Only a hold because of a force, and only while the filtered wrench is beyond the
-    dead zone: otherwise nothing but training's weak motors would slow the arm.
+    It does so only in a hold because of a force, and only while the filtered wrench is
+    beyond the dead zone: otherwise only training's weak motors would slow the arm.
     """
     if not (self.supervisor.pressed and self.virtual.admittance):
       return False

@@ -13,7 +13,7 @@ ROBOTS = ("ur5e", "simulated", "double")
 
 @dataclasses.dataclass(frozen=True)
 class Robot:
-  """Which robot to open; crosses the borders of processes."""
+  """Description of a robot, which is sent to each process."""
 
   kind: str
   """One of ``ROBOTS``."""

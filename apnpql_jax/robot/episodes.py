@@ -1,4 +1,4 @@
-"""What a session is to do, and what becomes of its episodes."""
+"""Options of a session, and the outcomes of its episodes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ SOLVED, TIME_LIMIT = "solved", "time limit"
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-  """How a session runs."""
+  """Options of a session."""
 
   seed: int = 0
   """Random seed of the policy and of simulated reset states."""
@@ -29,7 +29,7 @@ class Options:
 
 @dataclasses.dataclass(frozen=True)
 class Homing:
-  """What came of a motion to the neutral pose."""
+  """Outcome of a motion to the neutral pose."""
 
   unloaded_wrench: list[float] | None = None
   """What the hand read there, where nothing should touch it, f64[6] in N and N m, with
@@ -41,7 +41,7 @@ class Homing:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-  """What became of an episode."""
+  """Outcome of an episode."""
 
   solved: bool | None
   """Whether the task was solved; None if nobody can tell."""
@@ -68,10 +68,10 @@ class Outcome:
   """Index of the episode in the dataset of the log, if it is there."""
 
   homing_before: Homing = Homing()
-  """Of the homing before the episode, after which the sensor was zeroed."""
+  """Outcome of the homing before the episode, after which the sensor was zeroed."""
 
   homing_after: Homing | None = None
-  """Of the homing after the episode; None if there was none."""
+  """Outcome of the homing after the episode; None if there was none."""
 
   @property
   def stopped(self) -> bool:

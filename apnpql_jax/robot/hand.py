@@ -32,7 +32,7 @@ class Hand:
     self.error = ""
     """Why the gripper does not work; it stays."""
     self.since = -np.inf
-    """When the gripper was told something else than before."""
+    """When the command to the gripper last changed."""
     self._close: bool | None = None
     self._place, self._moved = self.state.angle, -np.inf
 

@@ -51,7 +51,7 @@ def opencv_lens(lens: Json, model: str, coefficients: Sequence[float]) -> Json:
 
 
 class Preparation:
-  """Turns images of a camera into those of a view of the contract."""
+  """Conversion of a camera's images to those of a view of the contract."""
 
   def __init__(self, lens: Json, view: Json):
     """Computes which pixels belong together.
@@ -92,7 +92,7 @@ class Preparation:
     """Returns the image of the view, u8[height, width, 3].
 
     Raises:
-      DeviceError: The image has another size than the lens is for.
+      DeviceError: The image has another size than the lens.
     """
     if image.shape[:2] != self._native:
       sizes = "x".join(map(str, image.shape[:2])), "x".join(map(str, self._native))

@@ -118,7 +118,7 @@ class MotionLimiter:
     self.position, self.velocity = np.zeros(6), np.zeros(6)
     self._inside = limits.box + np.array([MARGIN, -MARGIN])
     self._box = self._inside
-    """Where the tool may be: inside, or no further out than it has begun, f64[3, 2]."""
+    """Where the tool may be: inside, or no farther out than it has begun, f64[3, 2]."""
 
   def start(self, position: np.ndarray) -> str:
     """Begins at rest; returns why the arm must not move there, or an empty string."""
@@ -245,7 +245,7 @@ class MotionLimiter:
     return self.position.copy()
 
   def _tightened(self, box: np.ndarray, tool: np.ndarray) -> np.ndarray:
-    """Returns a box f64[3, 2] that a tool outside may not leave further outwards."""
+    """Returns the box f64[3, 2] without the part farther out than the tool is."""
     if _holds(self._inside, tool):
       return self._inside
     low = np.minimum(self._inside[:, 0], tool - _GRACE)

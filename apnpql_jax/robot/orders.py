@@ -31,7 +31,7 @@ class Orders:
 
   @property
   def done(self) -> bool:
-    """Whether its motion has ended; after a fault, the arm may still brake."""
+    """Whether the order's motion has ended; after a fault, the arm may still brake."""
     state = self._board["state"].read()
     return bool(state["number"] == self._number and state["done"])
 

@@ -24,7 +24,7 @@ Act = Callable[[dict[str, np.ndarray], int, int], np.ndarray]
 
 
 class Observer:
-  """Puts together what the policy sees: states, tool, images and their history."""
+  """Builder of the policy's observations: states, tool, images and their history."""
 
   def __init__(self, contract: dict[str, Any]):
     """Reads how many instants the policy sees."""
@@ -73,7 +73,7 @@ def next_period(number: int, elapsed: float, period: float) -> int:
 
 
 class Player:
-  """Plays episodes at the control period."""
+  """Player of episodes at the control period."""
 
   def __init__(
     self,
@@ -93,7 +93,7 @@ class Player:
       board: The board.
       cameras: The cameras, connected.
       act: The policy.
-      judge: What knows their scene, if something does.
+      judge: The judge of their scene, if there is one.
       recorder: Gets each episode.
       ending: Ends the episode when it is set.
     """

@@ -59,7 +59,7 @@ def load(path: Path) -> PolicyFolder:
   """Reads a folder and checks that the policy can drive this arm.
 
   Raises:
-    FileError: It is no exported policy, or damaged.
+    FileError: It is not an exported policy, or it is damaged.
     ConfigError: The policy needs what no sensor gives, or is for another arm, motor
       model or period.
   """

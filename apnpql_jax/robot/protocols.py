@@ -63,7 +63,7 @@ class Frame:
 
 
 class Device(Protocol):
-  """What all devices have."""
+  """Interface of all devices."""
 
   def connect(self) -> None:
     """Opens the device; nothing moves."""
@@ -97,7 +97,7 @@ class Arm(Device, Protocol):
     ...
 
   def start(self, *, zero: bool = True) -> None:
-    """Makes the arm follow commands; ``zero``: zeroes the wrench first, at rest."""
+    """Makes the arm follow commands; with ``zero``, zeroes the wrench at rest first."""
     ...
 
 
@@ -129,7 +129,7 @@ class Camera(Device, Protocol):
 
 
 class Judge(Protocol):
-  """What knows the whole scene; no sensor of a real arm does."""
+  """A judge that knows the whole scene, as no sensor of a real arm does."""
 
   def solved(self) -> bool:
     """Returns whether the task was solved at the newest frames."""

@@ -18,7 +18,7 @@ _AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
 
 
 class Recorder:
-  """Writes episodes when they end, because encoding takes longer than a period."""
+  """Writer of a log, which writes each episode at its end: encoding takes long."""
 
   def __init__(
     self,

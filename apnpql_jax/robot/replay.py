@@ -33,7 +33,7 @@ def recorded_actions(folder: Path, contract: Json) -> list[np.ndarray]:
 
   Raises:
     ConfigError: A package is missing.
-    FileError: It is no log, or differs from the contract; the message names the
+    FileError: It is not a log, or differs from the contract; the message names the
       difference.
   """
   dataset = lerobot.read(folder)
@@ -86,7 +86,7 @@ def _actions_of(contract: Any) -> Json | None:
 
 
 def _beyond(actions: list[np.ndarray], contract: Json) -> str:
-  """Returns which action is not one of the contract, or an empty string."""
+  """Returns which action is outside of the contract's range, or an empty string."""
   low, high = (np.array(contract["action"][key]) for key in ("low", "high"))
   found = np.concatenate(actions)
   outside = (found < low - _TOLERANCE) | (found > high + _TOLERANCE)

@@ -53,7 +53,7 @@ def run(
 
   Raises:
     ConfigError: A package is missing.
-    FileError: The log exists, or the log to replay is no log or does not fit the
+    FileError: The log exists, or the log to replay is not a log or does not fit the
       policy.
     DeviceError: A device or process has failed before the arm moved.
     RunStopped: One of ``INTERRUPTS`` came; with what is known about the arm.

@@ -28,7 +28,7 @@ POWER_ON = 3.0
 
 
 def load(wrench: np.ndarray) -> float:
-  """Returns a wrench f64[6] in terms of what a free hand reads: above 1 it touches."""
+  """Returns a wrench f64[6] relative to what a free hand may read; above 1: contact."""
   force, torque = np.linalg.norm(wrench.reshape(2, 3), axis=1)
   return float(max(force / FREE_FORCE, torque / FREE_TORQUE))
 

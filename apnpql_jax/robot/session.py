@@ -1,4 +1,4 @@
-"""A session: starts the processes of a robot, gives orders, and plays episodes."""
+"""A session: the processes of a robot, orders to them, and episodes."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Session(contextlib.AbstractContextManager):
     self._orders = Orders(self.board)
     self._operator: simulated.Operator | None = None
     self.homing = Homing()
-    """What came of the last ``go_home``."""
+    """Outcome of the last ``go_home``."""
     self.processes: Processes | None = None
     """The control and the policy process."""
 

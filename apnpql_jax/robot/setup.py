@@ -1,4 +1,4 @@
-"""Which robot a command is about, checked before anything is opened or moves."""
+"""The robot that a command is about, checked before anything is opened or moves."""
 
 from __future__ import annotations
 

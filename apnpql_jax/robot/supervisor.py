@@ -32,7 +32,7 @@ RUNAWAY = 1.2
 
 
 class Mode(enum.IntEnum):
-  """What the arm does."""
+  """Behavior of the arm in a cycle."""
 
   FOLLOW = 0
   HOLD = 1
@@ -44,7 +44,7 @@ class Action:
   """An action of the policy, as the control process gets it."""
 
   number: int
-  """Counts the actions of an episode, from 1."""
+  """Number of the action in its episode, from 1."""
 
   time: float
   """When it was chosen."""
@@ -53,11 +53,11 @@ class Action:
   """Desired joint velocities in rad/s, then 1 to close the gripper; f64[7]."""
 
   frames: np.ndarray
-  """When the frames were captured that it was chosen from, f64[2]: see ``CAMERAS``."""
+  """When the frames that it was chosen from were captured, f64[2]: see ``CAMERAS``."""
 
 
 class Supervisor:
-  """Watches measurements and actions of one episode."""
+  """Supervisor of the measurements and actions of one episode."""
 
   def __init__(self, limits: Limits, now: float):
     """Begins an episode at the time ``now``."""

@@ -64,7 +64,7 @@ DAMPED_RADIUS = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class Admittance:
-  """How the virtual arm answers contacts."""
+  """Parameters of the virtual arm's answer to contacts."""
 
   stiffness: float = 10_000.0
   """Stiffness k of the hardest contact to expect, N/m."""

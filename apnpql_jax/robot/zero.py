@@ -1,4 +1,4 @@
-"""When the force sensor may be zeroed: only while nothing presses on the hand.
+"""Zeroing of the force sensor, which is safe only while nothing presses on the hand.
 
 Zeroing makes a sensor report no force, so it hides whatever presses on the hand at that
 moment. A controller does not report how large the force was. So:
@@ -30,7 +30,7 @@ _READINGS = 50
 
 
 class Zero:
-  """Zeroes a sensor where that is safe."""
+  """Zeroing of a sensor where that is safe."""
 
   def __init__(self) -> None:
     """Begins with a sensor whose offset is not known."""
@@ -44,7 +44,7 @@ class Zero:
     self._readings.append(wrench)
 
   def forget(self) -> None:
-    """Drops all readings, as those of a moving arm."""
+    """Drops all readings, because they are those of a moving arm."""
     self._readings.clear()
     self.unloaded = np.full(6, np.nan)
 
@@ -63,7 +63,7 @@ class Zero:
 
     Args:
       arm: The arm.
-      again: Zeroes the sensor even if that has been done.
+      again: Whether to zero the sensor even if that has been done.
 
     Returns:
       Why the sensor must not be zeroed, or an empty string. The arm does not follow

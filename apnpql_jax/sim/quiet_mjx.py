@@ -1,4 +1,4 @@
-"""MJX; the only module that may import it, because that prints about optional Warp."""
+"""MJX, imported nowhere else, without what its import prints about optional Warp."""
 
 from apnpql_jax import runtime
 

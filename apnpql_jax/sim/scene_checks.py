@@ -1,4 +1,4 @@
-"""Checks of compiled scenes: what MJX supports, the robot as in its file, support.
+"""Checks of compiled scenes: features of MJX, the robot, contacts that hold bodies up.
 
 A scene may be anything that MuJoCo compiles, but the engines, the inverse kinematics
 and the reset states rely on the robot of ``mjcf/robot.xml``.
@@ -140,7 +140,7 @@ def check_keyframes(model: mujoco.MjModel, name: str) -> None:
   """Checks that hinges and slides are within their limits in every keyframe.
 
   Raises:
-    ConfigError: A joint of the scene ``name`` is not.
+    ConfigError: A joint of the scene ``name`` is outside of them.
   """
   kinds = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
   limited = np.flatnonzero(model.jnt_limited & np.isin(model.jnt_type, kinds))

@@ -1,4 +1,4 @@
-"""What a launcher does: it starts runs somewhere and finds out when they have ended."""
+"""The interface of launchers, which start runs and find out when they have ended."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LauncherName = Literal["local", "slurm", "slurm-local"]
 
 @dataclasses.dataclass(frozen=True)
 class Launch:
-  """How a sweep starts its runs. It is stored, so a resume starts runs the same way."""
+  """Launcher settings of a sweep, stored so that a resume starts runs the same way."""
 
   launcher: LauncherName = "local"
   slurm: Mapping[str, str | int] = dataclasses.field(default_factory=dict)
@@ -61,7 +61,7 @@ class Job(Protocol):
   """Name of the job in a cluster, to find it again; empty if that is impossible."""
 
   error: str
-  """Why a job has no exit code of its own; else empty."""
+  """Why a job has no exit code of its own; otherwise empty."""
 
   def poll(self) -> int | None:
     """Returns the exit code of ``apnpql train``, or None while it runs."""
@@ -71,7 +71,7 @@ class Job(Protocol):
 
 
 class Launcher(Protocol):
-  """Where runs are started."""
+  """Interface of what starts runs, on this machine or elsewhere."""
 
   jobs: int
   """Runs at the same time."""

@@ -30,7 +30,7 @@ _LOST = 1  # exit code of a job that ended without one
 
 
 class Task:
-  """What a job does: it trains a run as a process and passes signals on to it."""
+  """Function of a job: trains a run as a process and passes signals on to it."""
 
   def __init__(self) -> None:
     """Starts nothing yet."""

@@ -1,4 +1,4 @@
-"""Building a task by its name, and checking that it follows the protocol ``Task``.
+"""Building of tasks by name, with a check that they follow the protocol ``Task``.
 
 A method that returns a wrong shape would fail deep in a compiled program, or silently
 drive the wrong joint.

@@ -2,8 +2,8 @@
 
 A task is a Python file, an MJCF file and a preset: in this package, in a folder of the
 user, or in an installed package whose entry points in the group ``apnpql.tasks`` name
-the module that registers it. Everything is batched over
-worlds on the first axis; positions are in m in the world frame.
+the module that registers it. Everything is batched over worlds on the first axis;
+positions are in m in the world frame.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Task(Protocol):
 
 
 class _NameTaken(ConfigError):
-  """Another class has the name."""
+  """The error that another class has the name."""
 
   def __init__(self, message: str, name: str):
     super().__init__(message)

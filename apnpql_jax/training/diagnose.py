@@ -64,8 +64,8 @@ def diagnose(
 ) -> dict[str, Any]:
   """Plays held-out episodes with a checkpoint of a run and reports what limits them.
 
-  The arguments and errors are those of ``evaluate``. All figures but
-  ``solved`` are of episodes that ``acting`` plays.
+  The arguments and errors are those of ``evaluate``. All figures but ``solved`` are of
+  episodes that ``acting`` plays.
 
   Returns:
     acting: The rule that was played.

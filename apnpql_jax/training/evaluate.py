@@ -276,7 +276,7 @@ def _summary(
   began: float,
   video: Path | None,
 ) -> dict[str, Any]:
-  """Returns the figures and their context; films the first episodes if asked to."""
+  """Returns the figures and their context; writes the video if asked to."""
   summary: dict[str, Any] = {"task": env.config.task, "backend": env.physics.name}
   summary |= about | figures_of(played)
   if video is not None:

@@ -79,7 +79,7 @@ def disk_bytes(
 
   These are the newest ones, the best one, and the one being written. They share all
   segments of the expert replay, and those of the replay that do not change meanwhile.
-  Of a resumed run, what it has is not counted again.
+  What a resumed run already has on disk is not counted again.
   """
   agent, expert = (
     0 if ring is None else _nbytes(_arrays(ring, "").values())

@@ -1,4 +1,4 @@
-"""Start of a run: builds or restores all that the training loop needs."""
+"""Start of a run: all that the training loop needs, built or restored."""
 
 from __future__ import annotations
 

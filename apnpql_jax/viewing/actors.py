@@ -1,4 +1,4 @@
-"""Who acts in a watched world: a trained agent, the scripted expert, or chance."""
+"""Actors in a watched world: a trained agent, the scripted expert, or chance."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from apnpql_jax.types import ARM_DOF, Array
 
 
 class Decision(struct.PyTreeNode):
-  """What an actor does at an instant."""
+  """Actions of an actor at an instant, with what led to them."""
 
   action: Float[Array, "worlds 7"]
-  """The action."""
+  """The actions."""
 
   primitives: Float[Array, "worlds 3 7"]
   """Primitives that the actor sees: joint velocities in rad/s, share of closing."""
 
   explanation: Explanation | None = None
-  """What led to the action, of a trained agent."""
+  """What led to the actions; only of a trained agent."""
 
 
 class Actor(abc.ABC):
@@ -139,7 +139,7 @@ class Trained(Actor):
 def scripted(what: str, env: EnvConfig) -> Actor:
   """Returns the actor ``expert`` or ``random`` in the worlds of ``env``.
 
-  They see no images; the player draws them.
+  Its worlds have no images in the observations; the player draws them.
   """
   kinds = {"expert": Expert, "random": Random}
   check_name("actor", what, list(kinds))

@@ -34,7 +34,7 @@ class Player:
     """Prepares the world; the first ``step`` begins an episode.
 
     Args:
-      actor: Who acts.
+      actor: The actor.
       seed: Random seed of the episodes and actions.
       wide: Height and width of the image of the camera ``wide``; not drawn if None.
 

@@ -22,7 +22,7 @@ class Sheet:
   """
 
   def __init__(self, width: int, height: int, *, scale: int = 1):
-    """Takes its size in pixels, each of which becomes ``scale`` by ``scale`` ones."""
+    """Takes the size in pixels, each of which is drawn as ``scale`` x ``scale``."""
     self.width, self.height = width, height
     inches = width / _DPI, height / _DPI
     self.figure = Figure(figsize=inches, dpi=_DPI * scale, facecolor="white")

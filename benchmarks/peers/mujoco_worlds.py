@@ -21,7 +21,7 @@ GRIPPER_SPEED, GRIPPER_GAIN, FINGER_LENGTH, FINGER_ANGLE = 0.075, 10.0, 0.057, n
 
 
 class MujocoEnv:
-  """See ``worlds.Env``."""
+  """A ``worlds.Env`` in C MuJoCo."""
 
   def __init__(self, world: worlds.World):
     """Builds the world; renderers are built at the first image."""

@@ -20,7 +20,7 @@ FINGER_SPEED = 0.8  # rad/s; the pads close at about 75 mm/s.
 
 
 class BulletEnv:
-  """See ``worlds.Env``."""
+  """A ``worlds.Env`` in PyBullet."""
 
   def __init__(self, world: worlds.World):
     """Loads the scene of a world into a simulator of its own."""

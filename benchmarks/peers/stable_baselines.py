@@ -61,7 +61,7 @@ def sac(args: argparse.Namespace) -> list[dict[str, float]]:
   curve: list[dict[str, float]] = []
 
   class Evaluations(BaseCallback):
-    """Evaluates as often as ours; stops at the goal or when the time is over."""
+    """Evaluations as often as ours, until the goal or the end of the time."""
 
     def _on_training_start(self) -> None:
       self.began = time.monotonic()

@@ -65,7 +65,7 @@ class Played(NamedTuple):
   metrics: Metrics
 
   def prior(self) -> tuple[GripperGMM, jax.Array]:
-    """Of parameters far from their first values, with the predicted primitives."""
+    """Returns the prior of random parameters, and the predicted primitives."""
     rng = np.random.default_rng(0)
     params = jax.tree.map(
       lambda x: x + 0.1 * jnp.asarray(rng.normal(size=x.shape), jnp.float32),
@@ -100,7 +100,7 @@ def play(flags: str) -> Played:
 
 
 def left(played: Played) -> set[str]:
-  """Losses that there are and parameters that the update moved."""
+  """Returns the names of the losses and of the parameters that the update moved."""
   pairs = ({**state.params, "nu": state.nu} for state in (played.before, played.after))
   moved = jax.tree.map(lambda a, b: bool(np.any(a != b)), *pairs)
   groups = {group for group, tree in moved.items() if any(jax.tree.leaves(tree))}

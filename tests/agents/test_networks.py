@@ -153,7 +153,7 @@ def test_residual_blocks_start_as_the_identity_and_add_convolutions():
 
 
 def same_convolution(x: np.ndarray, kernel: np.ndarray, bias: np.ndarray) -> np.ndarray:
-  """3x3 with stride 1 and zero padding, by scipy: f64[b, H, W, C] -> [b, H, W, D]."""
+  """Convolves 3x3 with stride 1 and zero padding, by scipy, f64[b, H, W, C or D]."""
   y = np.zeros((*x.shape[:3], kernel.shape[-1])) + bias
   for one, (c, d) in itertools.product(range(len(x)), np.ndindex(kernel.shape[2:])):
     y[one, ..., d] += ndimage.correlate(
@@ -163,7 +163,7 @@ def same_convolution(x: np.ndarray, kernel: np.ndarray, bias: np.ndarray) -> np.
 
 
 def expected_positions(scores: jax.Array) -> np.ndarray:
-  """f32[b, H, W, C] -> f64[b, 2 C], by a histogram of each axis."""
+  """Maps f32[b, H, W, C] to f64[b, 2 C], by a histogram of each axis."""
   _, height, width, _ = scores.shape
   shares = special.softmax(4.0 * np.asarray(scores, np.float64), axis=(1, 2))
   row = np.einsum("bhwc,h->bc", shares, np.linspace(-1, 1, 2 * height + 1)[1::2])
@@ -247,7 +247,7 @@ def test_features_resolve_a_centimeter_near_the_tool():
   params = jax.jit(networks.init)(jax.random.key(0), seen)
 
   def phi(offset: float) -> jax.Array:
-    """Three points on one side of the tool."""
+    """Returns three points on one side of the tool."""
     assert seen.tool is not None
     points = jnp.tile(seen.tool + offset, (1, 3))
     return networks.at(params, seen.replace(objects=points)).phi
@@ -355,7 +355,7 @@ def test_fresh_networks_predict_the_configured_start():
 
 
 def fresh_heads(config: AgentConfig) -> Heads:
-  """Untrained networks at eight states."""
+  """Returns untrained networks at eight states."""
   networks, seen = all_networks(config), observation(8, pixels=False)
   return networks.at(jax.jit(networks.init)(jax.random.key(0), seen), seen)
 

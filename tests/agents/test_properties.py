@@ -16,12 +16,12 @@ ATOMS = categorical.support(v_min=-1.0, v_max=2.0, num_atoms=BINS)
 
 
 def number(low: float, high: float) -> st.SearchStrategy[float]:
-  """A float that f32 holds exactly."""
+  """Draws a float that f32 holds exactly."""
   return st.floats(low, high, allow_nan=False, width=32)
 
 
 def arrays(*shape: int, low: float, high: float) -> st.SearchStrategy[np.ndarray]:
-  """f32 of the shape, every entry drawn by itself."""
+  """Draws f32 of the shape, every entry by itself."""
   size = int(np.prod(shape))
   numbers = st.lists(number(low, high), min_size=size, max_size=size)
   return numbers.map(lambda x: np.array(x, np.float32).reshape(shape))
@@ -83,7 +83,7 @@ def test_projection_keeps_mass_and_the_clipped_mean(logits, reward, discount):
 
 @jax.jit
 def losses_of(draws: dict, states: dict) -> dict:
-  """Every formula of the learner, f32[6, ...] each, by what it is called."""
+  """Returns every formula of the learner, f32[6, ...] each, by what it is called."""
   q, samples, alpha = draws["q"], draws["samples"], states["alpha"]
   weights = boltzmann.importance_weights(q, alpha)
   target = losses.value_target(

@@ -91,7 +91,7 @@ class Example(NamedTuple):
 
 @functools.cache
 def example_of(name: str, components: int = 1) -> Example:
-  """Parameters far from their first values, where no two candidates are alike."""
+  """Returns an example with random parameters, so that no two candidates are alike."""
   config = dataclasses.replace(SMALL, algorithm=name, policy_components=components)
   agent, row = make_agent(config), algorithm_of(config)
   batch = random_batch(1, BATCH, windows=config.n_step)
@@ -120,7 +120,7 @@ def example_of(name: str, components: int = 1) -> Example:
 
 
 def touched(slope: dict) -> set[str]:
-  """Groups in which any entry of the gradient differs from zero."""
+  """Returns groups in which any entry of the gradient differs from zero."""
   return {k for k, g in slope.items() if any(np.any(x) for x in jax.tree.leaves(g))}
 
 
@@ -190,7 +190,7 @@ def regularizer_of(name: str, heads: Heads, target_heads: Heads) -> ActionDistri
 
 
 def log_prob(distribution: ActionDistribution, actions: Array) -> np.ndarray:
-  """f64[S, B], one state after the other."""
+  """Computes log densities f64[S, B], one state after the other."""
   if isinstance(distribution, UniformBox):
     return np.full(actions.shape[:2], -7.0 * np.log(2.0))
   each = [
@@ -211,7 +211,7 @@ def of_q(heads: Heads, prior: ActionDistribution, key: Array):
 
 
 def of_pi(heads: Heads, key: Array):
-  """Half as many draws of the arm, each open and closed, and their weights."""
+  """Returns half as many draws of the arm, each open and closed, and their weights."""
   policy, half = heads.policy(), SMALL.policy_samples // 2
   drawn = policy.sample(seed=key, sample_shape=half)
   samples = jnp.concatenate([drawn.at[..., 6].set(x) for x in (0.0, 1.0)])
@@ -220,7 +220,7 @@ def of_pi(heads: Heads, key: Array):
 
 
 def of_good(heads: Heads, actions: Array, key: Array):
-  """The replayed actions; the weight is one where they are no worse than pi."""
+  """Returns the replayed actions; the weight is one where they are no worse than pi."""
   samples, weights = of_pi(heads, key)
   q, q_pi = values(heads, actions[None])[0], values(heads, samples)
   good = [float(q[i] - weights[:, i] @ q_pi[:, i] >= 0.0) for i in range(BATCH)]

@@ -25,7 +25,7 @@ CAMERAS = {"global": (72, 96), "wrist": (36, 64)}
 
 
 def random_world(model: mujoco.MjModel, rows: int) -> World:
-  """Joints anywhere, objects and marks anywhere about where they are."""
+  """Draws joints anywhere, and objects and marks near where they are."""
   rng, data = np.random.default_rng(0), mujoco.MjData(model)
   qpos = np.tile(model.key("neutral").qpos, (rows, 1))
   for joint in range(model.njnt):
@@ -122,7 +122,7 @@ def test_urdf_refuses_what_it_cannot_express():
 
 @pytest.fixture
 def settings(tmp_path) -> dict:
-  """Settings of a side with MuJoCo's worlds."""
+  """Returns the settings of a side with MuJoCo's worlds."""
   worlds.export("push_plate", CAMERAS, tmp_path)
   return {"folder": str(tmp_path), "gymnasium": False}
 

@@ -18,14 +18,14 @@ PRESET = dict(codec.flatten(files.load_preset("push_plate")))
 
 
 def table(*header: str) -> list[list[str]]:
-  """Cells of the rows below a header that name settings."""
+  """Returns the cells of the rows below a header that name settings."""
   text = PAGE.split(f"| {' | '.join(header)} |\n")[1].split("\n\n")[0]
   rows = [[x.strip() for x in line.split("|")[1:-1]] for line in text.splitlines()[1:]]
   return [row for row in rows if names(row[header.index("setting")])]
 
 
 def names(cell: str) -> list[str]:
-  """Settings of a cell; the first one gives the group, or all but the last word."""
+  """Returns the settings in a cell; the first one completes the names of the others."""
   found = re.findall(r"`([\w.]+)`", cell)
   if not found:
     return []

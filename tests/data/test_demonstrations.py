@@ -57,7 +57,7 @@ def _load(path: Path, env: Env) -> Demonstrations:
 
 @pytest.fixture(scope="module")
 def whole() -> tuple[Env, Demonstrations]:
-  """Worlds with time to solve the task, and episodes in which the expert does."""
+  """Returns worlds with time to solve the task, and episodes of the expert that do."""
   env = make_env(testing.TINY.env)
   demos = expert.record_expert(env, episodes=4, seed=0, noise=0.0)
   assert demonstrations.solved(demos, env.task, env.config).all()
@@ -329,7 +329,7 @@ CONVENTIONS: dict[str, Any] = {
 def _recording(
   env: Env, demos: Demonstrations, *, every: float = 0.05, late: float = 0.0
 ) -> dict[str, Any]:
-  """The episodes as somebody would have measured them: more often, from ``late`` on."""
+  """Returns the episodes as measured by somebody: more often, from ``late`` on."""
   free, _ = env.task.scene.free_joint("plate")
   finger = env.task.scene.gripper_qpos
   times, parts = [], []

@@ -42,7 +42,7 @@ def _example(pixels: int = 2) -> Slot:
 
 
 def _stream(steps: int, worlds: int, end_rate: float, seed: int) -> Slot:
-  """Random slots [steps, worlds]; the robot state is the slot's (time, world)."""
+  """Draws slots [steps, worlds]; the robot state is the slot's (time, world)."""
   rng: Any = np.random.default_rng(seed)
   end: Any = rng.random((steps, worlds)) < end_rate
   terminated = end & (rng.random((steps, worlds)) < 0.5)
@@ -157,7 +157,7 @@ def test_no_transition_leaves_its_episode(n_step: int):
 
 
 def _until_end(step: TimeStep, t: int, w: int, n_step: int) -> list[int]:
-  """Slots 1 to N after t; from the first end on only that."""
+  """Returns the slots 1 to N after t; from the first end on, only that one."""
   slots = []
   for _ in range(n_step):
     t += not slots or not (step.terminated[t, w] or step.truncated[t, w])
@@ -184,7 +184,7 @@ def test_windows_are_the_slots_after_the_start_across_the_seam():
 
 
 def _up_to(step: TimeStep, t: int, w: int, instants: int) -> list[int]:
-  """The last slots of an episode up to t, its first one as often as it takes."""
+  """Returns the last slots of an episode up to t; the first one fills the others."""
   slots = [t]
   while len(slots) < instants:
     t -= not (step.terminated[t - 1, w] or step.truncated[t - 1, w])
@@ -259,7 +259,7 @@ def test_an_excluded_episode_after_an_end_counts_with_it():
 
 
 def _counted(excluded: int, ends: Sequence[int] = ()) -> list[int]:
-  """Successes and ends; world 1 times out at ``ends`` and then excludes slots."""
+  """Counts successes and ends; world 1 times out at ``ends``, then excludes slots."""
   stream = _stream(12, WORLDS, end_rate=0.0, seed=0)
   stream.timestep.terminated[[2, 9], 0] = True
   stream.timestep.truncated[6, 0] = True

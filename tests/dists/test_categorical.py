@@ -16,7 +16,7 @@ ATOMS = categorical.support(v_min=-1.0, v_max=2.0, num_atoms=51)
 
 
 def random_case(seed: int, batch: int = 40):
-  """Distributions, rewards that leave the support, discounts with zeros."""
+  """Returns distributions, rewards that leave the support, discounts with zeros."""
   rng = np.random.default_rng(seed)
   probs = rng.dirichlet(np.full(51, 0.3), size=batch)
   reward = rng.uniform(-2.0, 3.0, batch)
@@ -25,7 +25,7 @@ def random_case(seed: int, batch: int = 40):
 
 
 def loop_projection(probs, reward: float, discount: float, atoms) -> np.ndarray:
-  """Algorithm 1 of Bellemare, Dabney and Munos (2017)."""
+  """Computes Algorithm 1 of Bellemare, Dabney and Munos (2017)."""
   low, high = atoms[0], atoms[-1]
   spacing = (high - low) / (len(atoms) - 1)
   out = np.zeros(len(atoms))

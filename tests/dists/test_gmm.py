@@ -192,7 +192,7 @@ def test_gripper_belongs_to_the_component_of_the_arm():
 
 
 def integrated_entropy(mixture: GripperGMM) -> float:
-  """Of a mixture over one continuous dimension and the gripper."""
+  """Integrates the entropy of a mixture over one joint velocity and the gripper."""
   x = np.linspace(-30.0, 30.0, 60_001)
   total = 0.0
   for gripper in (0.0, 1.0):
@@ -241,7 +241,7 @@ def test_entropy_bound_in_six_dimensions_against_monte_carlo():
 
 
 def numpy_bound(mixture: GripperGMM) -> float:
-  """The pairwise bound written out in double precision."""
+  """Computes the pairwise bound, written out in double precision."""
   scale = np.asarray(mixture.scale_tril, np.float64)
   covariance = scale @ scale.swapaxes(-1, -2)
   weights = special.softmax(np.asarray(mixture.logits, np.float64))

@@ -42,7 +42,7 @@ def env() -> Env:
 
 @pytest.fixture(scope="module")
 def pixel_chunk(env) -> TimeStep:
-  """Twelve periods of the expert in four worlds, with images of both cameras."""
+  """Plays twelve periods of the expert in four worlds, with images of both cameras."""
   pixels = Env(dataclasses.replace(CONFIG, obs="pixels"), env.task, env._bank)
   states = [pixels.reset(jnp.arange(4))]
   for key in jax.random.split(jax.random.key(0), 11):

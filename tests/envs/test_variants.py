@@ -27,7 +27,7 @@ def task():
 
 @pytest.fixture(scope="module")
 def models(task) -> list[mujoco.MjModel]:
-  """The variants, compiled independently of the code under test."""
+  """Returns the variants, compiled independently of the code under test."""
   models = []
   for shape in flip_cup.SHAPES:
     spec = mujoco.MjSpec.from_file(str(mjcf_path("flip_cup")))
@@ -38,7 +38,7 @@ def models(task) -> list[mujoco.MjModel]:
 
 @pytest.fixture(scope="module")
 def state(task) -> physics.PhysicsState:
-  """Cups of all shapes, first spinning high in the air, then just above the table."""
+  """Returns cups of all shapes, spinning high in the air, then just above the table."""
   state, _ = each_cup(task, WORLDS)
   _, dof = task.scene.free_joint("cup")
   raised = pos(task, state, "cup").at[:, 2].add(np.repeat([0.2, 0.002], 3))
@@ -48,7 +48,7 @@ def state(task) -> physics.PhysicsState:
 
 @pytest.fixture(scope="module", params=["native", "mjx"])
 def fall(request, task, state):
-  """Poses of the cups after 0.15 s with the arm at rest, f32[WORLDS, 7].
+  """Returns the poses of the cups after 0.15 s with the arm at rest, f32[WORLDS, 7].
 
   Compiled ahead of time, so that inputs which need another compilation are an error.
   """
@@ -98,7 +98,7 @@ def test_worlds_change_their_shapes_without_recompilation(state, fall, moved):
 
 @pytest.fixture(scope="module", params=SLOW_MJX)
 def env(request) -> Env:
-  """Environment with episodes of two periods."""
+  """Returns an environment with episodes of two periods."""
   return make_env(
     EnvConfig(
       task="flip_cup",

@@ -15,7 +15,7 @@ BANDIT = runpy.run_path(str(ROOT / "experiments" / "results" / "bimodal_bandit.p
 
 @pytest.fixture(scope="module")
 def played() -> dict[str, tuple[np.ndarray, float]]:
-  """Algorithm -> share of its actions at either peak, mean reward."""
+  """Returns algorithm -> share of its actions at either peak, mean reward."""
   found = {}
   for name in BANDIT["ALGORITHMS"]:
     config = dataclasses.replace(BANDIT["CONFIG"], algorithm=name)

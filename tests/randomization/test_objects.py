@@ -82,7 +82,7 @@ def scene(tmp_path_factory) -> Scene:
 
 @pytest.fixture(scope="module")
 def state(scene) -> PhysicsState:
-  """Worlds whose objects touch the shelf, in any orientation."""
+  """Returns worlds whose objects touch the shelf, in any orientation."""
   qpos = np.tile(scene.keyframe("neutral"), (8, 1))
   turns = Rotation.random(8 * len(THINGS), rng=0).as_quat(scalar_first=True)
   places = qpos[:, 10:].reshape(8, -1, 7)

@@ -310,7 +310,7 @@ def test_surroundings_are_table_and_background_alone(task):
 
 @pytest.fixture(scope="module", params=task_names())
 def any_task(request):
-  """A task and randomized worlds of it."""
+  """Returns a task and randomized worlds of it."""
   task = make_task(request.param)
   return task, _randomized(task, seed=1)
 

@@ -135,7 +135,7 @@ def silent_gripper(world: World) -> None:
 
 
 def dropped_arm(world: World) -> None:
-  """The last measurement stays, and the driver says why a while later."""
+  """Keeps the last measurement; the driver says why a while later."""
   world.measured_at = world.now - 0.2
   world.fault = LOST
 

@@ -50,7 +50,7 @@ def pixels(lens: images.Json) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def state() -> dict:
-  """The keyframe "neutral" of push_plate."""
+  """Returns the keyframe "neutral" of push_plate."""
   model = compile_scene("push_plate")
   return {
     "qpos": model.key("neutral").qpos,

@@ -55,7 +55,7 @@ def proposals(seed: int, count: int) -> np.ndarray:
 
 
 class Watch:
-  """Checks each command of a limiter, and keeps how much of each limit it has used."""
+  """Check of each command of a limiter, with the share of each limit that was used."""
 
   def __init__(self, limiter: MotionLimiter):
     self.limiter, self.limits = limiter, limiter.limits

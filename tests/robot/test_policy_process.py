@@ -158,7 +158,7 @@ def test_a_disk_that_fills_ends_the_session_with_one_line(folder):
 
 
 def compiling(peer: Any) -> None:
-  """A policy process that is not ready yet."""
+  """Returns a policy process that is not ready yet."""
   never = threading.Event()
   args = peer, never, threading.Event()
   threading.Thread(target=policy_process._end_with, args=args, daemon=True).start()

@@ -89,7 +89,7 @@ def solved(instants: Iterator[EnvState]) -> int:
 
 @pytest.fixture(scope="module")
 def instants(env, step) -> list[EnvState]:
-  """Undisturbed episodes."""
+  """Returns undisturbed episodes."""
   return list(play(env, step))
 
 

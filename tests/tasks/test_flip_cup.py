@@ -44,13 +44,13 @@ def cups(task):
 
 @pytest.fixture(scope="module")
 def resets(cups):
-  """Initial states with the three shapes in turn."""
+  """Returns initial states with the three shapes in turn."""
   return cups[0]
 
 
 @pytest.fixture(scope="module")
 def half(cups) -> np.ndarray:
-  """Half the width and half the height of each cup, f64[WORLDS, 2], m."""
+  """Returns half the width and half the height of each cup, f64[WORLDS, 2], m."""
   return cups[1]
 
 

@@ -88,7 +88,7 @@ def test_every_gap_lies_within_the_joints_range(robot):
 
 @pytest.fixture(scope="module")
 def stack_box():
-  """A scene; any with a robot would do."""
+  """Returns a scene; any with a robot would do."""
   return make_task("stack_box")
 
 

@@ -84,7 +84,7 @@ def hand_at(task, state, kinematics, neutral, shift=(0.0, 0.0, 0.0), twist=0.0):
 
 @pytest.fixture(scope="module")
 def solved(task, resets):
-  """Worlds with the plate at rest on its edge in the middle of the box."""
+  """Returns worlds with the plate at rest on its edge in the middle of the box."""
   return in_box(task, resets, (0.0, 0.0, RADIUS))
 
 

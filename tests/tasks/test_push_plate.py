@@ -22,7 +22,7 @@ from apnpql_jax.tasks import push_plate
 
 @pytest.fixture(scope="module")
 def solved(task, resets):
-  """Worlds with the plate at rest exactly on the goal."""
+  """Returns worlds with the plate at rest exactly on the goal."""
   goal = resets.mocap_pos[:, task.scene.mocap("goal"), :2]
   plate = pos(task, resets, "plate").at[:, :2].set(goal)
   return put(task, resets, "plate", plate)

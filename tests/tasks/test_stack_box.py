@@ -41,7 +41,7 @@ def task():
 
 @pytest.fixture(scope="module")
 def solved(task, resets):
-  """Worlds with the yellow box at rest exactly on the blue one."""
+  """Returns worlds with the yellow box at rest exactly on the blue one."""
   return put(task, resets, "yellow", pos(task, resets, "blue") + jnp.array(ON_BLUE))
 
 

@@ -93,7 +93,7 @@ def test_a_world_that_breaks_does_not_count_its_next_episode(recorded):
 
 
 def hand_made() -> Instants:
-  """Three worlds: solved after two actions; lost after the goal; never gripped."""
+  """Returns three worlds: solved after two actions; lost after the goal; no grip."""
   active = np.array([[1, 1, 1], [1, 1, 1], [0, 1, 1], [0, 0, 0]], bool)
   solved = np.zeros((4, 3), bool)
   solved[2, 0] = True

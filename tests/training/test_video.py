@@ -14,7 +14,7 @@ from apnpql_jax.training import video
 
 
 def _frames(length: int, height: int, width: int, seed: int = 0) -> np.ndarray:
-  """Blocks of flat color that change from frame to frame."""
+  """Returns blocks of flat color that change from frame to frame."""
   rng = np.random.default_rng(seed)
   blocks = rng.integers(0, 256, (length, height // 12, width // 12, 3), np.uint8)
   return blocks.repeat(12, axis=1).repeat(12, axis=2)

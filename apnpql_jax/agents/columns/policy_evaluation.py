@@ -31,7 +31,7 @@ TargetPolicy = Callable[[Observation], tuple[Heads, Candidates]]
 
 @dataclasses.dataclass(frozen=True)
 class PolicyEvaluation(abc.ABC):
-  """How values are represented and learned."""
+  """A representation of values and the way in which they are learned."""
 
   config: AgentConfig
   windows: ClassVar[bool] = False  # whether the target needs ``Transition.window``

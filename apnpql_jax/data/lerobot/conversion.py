@@ -1,4 +1,4 @@
-"""Demonstrations to the columns of a dataset, and back."""
+"""Conversion of demonstrations to the columns of a dataset, and back."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def convert(folder: Path, scene: Scene, *, period_s: float) -> Demonstrations:
   recording, see ``recordings``.
 
   Raises:
-    FileError: The folder is no dataset, is damaged, holds no poses of the objects, or
-      does not fit the scene.
+    FileError: The folder is not a dataset, is damaged, holds no poses of the objects,
+      or does not fit the scene.
   """
   dataset = read(folder)
   try:

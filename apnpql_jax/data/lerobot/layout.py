@@ -34,8 +34,8 @@ IMAGES = "observation.images."
 ENVIRONMENT = "observation.environment_state"
 SUCCESS = "next.success"
 TIMES = "times"
-"""Column of a log: measured times since the beginning of the episode, s. Its name makes
-it no input of LeRobot's policies, which take all columns of "observation"."""
+"""Column of a log: measured times since the beginning of the episode, s. With this
+name, it is no input of LeRobot's policies, which take all of "observation"."""
 
 COUNTERS = {
   "timestamp": "float32",

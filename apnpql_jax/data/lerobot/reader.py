@@ -20,7 +20,7 @@ from apnpql_jax.errors import FileError, UserError, one_line
 
 @dataclasses.dataclass(frozen=True)
 class Episode:
-  """What was recorded of one episode, in n frames."""
+  """Recorded data of one episode, in n frames."""
 
   task: str
   """What the robot was to do, in words."""
@@ -94,7 +94,7 @@ def read(folder: Path | str) -> Dataset:
 
   Raises:
     ConfigError: pyarrow is missing.
-    FileError: The folder is no dataset of version 3, is damaged, or lacks
+    FileError: The folder is not a dataset of version 3, is damaged, or lacks
       "observation.state" or "action" of 7 numbers.
   """
   layout.check_available()

@@ -25,7 +25,7 @@ def of_numbers(values: np.ndarray) -> Stats:
 
 
 class Pixels:
-  """Counts how often each color value occurs in the frames of a video."""
+  """Histogram of the color values in the frames of a video."""
 
   def __init__(self) -> None:
     self._counts = np.zeros((3, 256), np.int64)

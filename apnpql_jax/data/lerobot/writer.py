@@ -48,8 +48,8 @@ class Writer:
       images: Column of images -> height and width, such as "observation.images.wrist".
       robot_type: Name of the robot.
       about: Anything else to record, such as devices, as JSON.
-      judged: Whether each episode is given a success. The dataset has no "next.success"
-        otherwise, because a learner would take a value of it for the truth.
+      judged: Whether each episode is given a success. Otherwise the dataset has no
+        "next.success", because a learner would take a value of it for the truth.
 
     Raises:
       ConfigError: pyarrow is missing.

@@ -73,12 +73,12 @@ class Seen(NamedTuple):
 
 
 def parse(text: str) -> Board:
-  """Returns the board of a text such as 7x5:36:27:5x5_100.
+  """Returns the board that a text such as 7x5:36:27:5x5_100 describes.
 
   Columns and rows, side of a square and of a marker in mm, and the dictionary.
 
   Raises:
-    ConfigError: The text is no board.
+    ConfigError: The text does not describe a board.
   """
   number = r"(\d+(?:\.\d+)?)"
   found = re.fullmatch(rf"(\d+)x(\d+):{number}:{number}:(\w+)", text)

@@ -137,7 +137,7 @@ def _kept(
 ) -> dict[str, CalibratedCamera]:
   """Returns the cameras of an earlier calibration, if some have no new views.
 
-  Else the file may as well be damaged.
+  If all have new views, the file is not read and may be damaged.
   """
   if not out.exists() or contract["cameras"].keys() <= found.keys():
     return {}

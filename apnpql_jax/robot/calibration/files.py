@@ -44,7 +44,7 @@ class Calibration:
 
   created: str
   contract_sha256: str
-  """Of the contract that it was made with; another may have the same cameras."""
+  """Hash of the contract that it was made with; others may have the same cameras."""
 
   board: str
   cameras: Mapping[str, CalibratedCamera]
@@ -83,7 +83,7 @@ def read(path: Path) -> Calibration:
   """Reads a calibration, for whichever contract.
 
   Raises:
-    FileError: The file is missing, damaged, or no calibration.
+    FileError: The file is missing, damaged, or not a calibration.
   """
   try:
     value = json.loads(path.read_text(encoding="utf-8"))

@@ -82,7 +82,7 @@ class Lens:
 
 
 def estimate(board: Board, seen: list[Seen], size: tuple[int, int]) -> Lens:
-  """Returns the lens that explains views of a board, of images of height and width.
+  """Returns the lens that explains views of a board; ``size`` is height and width.
 
   Raises:
     ConfigError: There are too few views.

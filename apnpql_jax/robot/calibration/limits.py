@@ -1,4 +1,4 @@
-"""Whether a camera is where the policy was trained for."""
+"""Limits on how far a camera may be from where the policy was trained for."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ this much along and about each axis."""
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-  """How far a camera is from its place in the contract, and how far it may be."""
+  """Distance of a camera from its place in the contract, and the limits of it."""
 
   shift: np.ndarray  # f64[3], m, along the axes named by ``axes``
   turn: np.ndarray  # f64[3], rad, about the camera's own x, y and z

@@ -10,8 +10,8 @@ from apnpql_jax.robot.calibration.views import MeasuredArm, NativeCamera
 from apnpql_jax.robot.devices import connected
 
 SIZE = 720, 1280
-"""Height and width of the mode for views: D435 and D455 have it, and markers are small.
-The pose of the camera holds for its other modes, too."""
+"""Height and width of views. D435 and D455 have this mode, and markers are small. The
+pose of a camera is the same in all of its modes."""
 
 
 @contextlib.contextmanager

@@ -1,1 +1,1 @@
-"""What `apnpql robot check` reads, tries and shows; nothing moves."""
+"""The action `apnpql robot check`: what it reads, tries and shows; nothing moves."""

@@ -25,7 +25,7 @@ _ACTION = (7,)
 
 @dataclasses.dataclass(frozen=True)
 class Senses:
-  """What reads the devices."""
+  """Functions that read the devices."""
 
   joints: Callable[[], np.ndarray]
   """Joint angles f64[6], rad."""
@@ -60,7 +60,7 @@ def try_out(act: Act, robot: Robot, senses: Senses) -> tuple[float, np.ndarray]:
     chosen, f64[2], s.
 
   Raises:
-    UserError: An action is not one for this arm, the program fails, or a device.
+    UserError: An action is not one for this arm, or the program or a device fails.
   """
   clock, observer = robot.clock, Observer(robot.contract)
   period = robot.contract["control_period_s"]

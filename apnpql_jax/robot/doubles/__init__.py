@@ -53,7 +53,7 @@ def start(
 
   Args:
     task: Name of the task, or path of its MJCF file.
-    contract: That of the policy, see ``deploy.contract``; no cameras without.
+    contract: That of the policy, see ``deploy.contract``; without it, no cameras.
     settings: See ``serve``.
 
   Raises:
@@ -86,7 +86,7 @@ def serve(
     task: Name of the task, or path of its MJCF file.
     noise: Whether the force-torque sensor is noisy.
     gripper: Model number of the gripper.
-    model_number: What it gives as its model number, if not that.
+    model_number: The number that it reports, if another one.
     modbus: Whether the gripper speaks Modbus-RTU.
     controller: Arguments of ``controller.Controller``.
   """

@@ -1,8 +1,9 @@
 """A UR controller: what its program, its safety system and its dashboard do.
 
 URScript is not interpreted. The client ur_rtde uploads a program that takes a command
-from input registers in each cycle, and answers in output registers; the double obeys
-the same commands (``rtde_control.script`` of ur_rtde 1.6) when any program was sent.
+from input registers in each cycle, and answers in output registers. Once any program
+has been sent, the double obeys the same commands (``rtde_control.script`` of ur_rtde
+1.6).
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ class Controller:
     self._safety_stop("PROTECTIVE_STOP")
 
   def emergency_stop(self) -> None:
-    """Stops as if the button was pushed."""
+    """Stops as if the emergency button had been pushed."""
     self._safety_stop("ROBOT_EMERGENCY_STOP")
 
   def cycle(self) -> None:

@@ -1,7 +1,7 @@
 """A gripper that speaks Dynamixel protocol 2.0 on a pseudo-terminal.
 
-After the protocol's page in the manufacturer's e-Manual. Registers that the driver does
-not use hold zero.
+It follows the protocol's page in the manufacturer's e-Manual. Registers that the driver
+does not use hold zero.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _ACCELERATION = {"RH-P12-RN": 214.577, "RH-P12-RN(A)": 1.0}  # rev/min^2 per uni
 
 
 class Gripper:
-  """The registers, and what they make the plant's fingers do."""
+  """Registers, and what they make the plant's fingers do."""
 
   def __init__(self, table: Table, plant: World, model_number: int | None = None):
     """Starts with the torque off; another model number is for tests."""

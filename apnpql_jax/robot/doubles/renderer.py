@@ -15,7 +15,7 @@ AMBIENT, DIFFUSE = 0.35, 0.65
 
 
 class Renderer:
-  """Draws a scene from its own cameras with other fields of view."""
+  """Renderer of a scene from its own cameras, with other fields of view."""
 
   def __init__(self, scene: str, fields_of_view: dict[str, float], size: list[int]):
     """Compiles the scene.

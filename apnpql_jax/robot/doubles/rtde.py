@@ -1,6 +1,6 @@
 """RTDE, version 2: the messages by which a UR controller exchanges data.
 
-After the real-time data exchange (RTDE) guide of Universal Robots. A message is its
+As in the real-time data exchange (RTDE) guide of Universal Robots, a message is its
 length (u16, the header of 3 bytes included), its type (a letter) and a payload, all
 numbers big-endian. Clients ask for recipes of named variables, receive one package of
 outputs per cycle, and write packages of input registers.

@@ -1,6 +1,6 @@
 """The process of the doubles: sockets, serial port and plant in one loop of 2 ms.
 
-One thread serves all. It works off what arrives until the next cycle is due, so that
+One thread serves all. It handles what arrives until the next cycle is due, so that
 nothing waits for the interpreter's lock, and no lock is needed.
 """
 
@@ -33,7 +33,7 @@ _CATCH_UP = 10  # cycles; a machine that is later than this loses time instead
 
 
 class Server:
-  """Listens for clients on one loopback address, and drives the plant."""
+  """Server of the clients on one loopback address, which also drives the plant."""
 
   def __init__(self, host: str, controller: Controller):
     """Opens the ports.
@@ -170,7 +170,7 @@ class Server:
 
 
 class Remote:
-  """What other processes may ask for, by name; see ``ask``."""
+  """Methods that other processes may call by name; see ``ask``."""
 
   def __init__(
     self, plant: World, controller: Controller, gripper: Gripper, server: Server
@@ -236,7 +236,7 @@ def ask(host: str, name: str) -> Any:
 
 
 def main(pipe: Connection) -> None:
-  """Runs arm and gripper with the settings of the parent, until that ends."""
+  """Runs arm and gripper with the settings of the parent, until the parent ends."""
   settings = pipe.recv()
   plant = World(settings["scene"], noise=settings["noise"])
   controller = Controller(plant, **settings["controller"])

@@ -35,7 +35,7 @@ _SILENT = "it does not answer: check its power and cable"
 
 
 class Silent(DeviceError):
-  """Nothing answers on the bus."""
+  """The error that nothing answers on the bus."""
 
 
 class Bus(Protocol):
@@ -57,7 +57,7 @@ class Bus(Protocol):
 
 
 class Dynamixel:
-  """Protocol 2.0, by ``dynamixel-sdk``."""
+  """A bus that speaks Dynamixel protocol 2.0, by ``dynamixel-sdk``."""
 
   name = "Dynamixel 2.0"
 
@@ -100,8 +100,8 @@ class Dynamixel:
   ) -> list[Any]:
     """Returns what a call of the SDK returns before its result and error.
 
-    It tries again where either packet has been damaged on its way. If that is the
-    instruction, the gripper reports it in an answer without data, which is whole.
+    It tries again if either packet was damaged on its way. The gripper reports a
+    damaged instruction in an intact answer without data.
     """
     for attempt in range(ATTEMPTS):
       try:
@@ -120,7 +120,7 @@ class Dynamixel:
 
 
 class Modbus:
-  """Modbus-RTU, by ``pymodbus``."""
+  """A bus that speaks Modbus-RTU, by ``pymodbus``."""
 
   name = "Modbus-RTU"
 

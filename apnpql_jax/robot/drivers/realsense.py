@@ -31,7 +31,7 @@ _SILENCE = 1.0  # s without a new frame after which the camera counts as lost
 
 
 class RealSense:
-  """A ``Camera``, which also gives its images as they are."""
+  """A ``Camera`` that also gives its images as they are."""
 
   def __init__(
     self,

@@ -42,7 +42,7 @@ class Field:
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-  """What the driver needs of a control table."""
+  """The part of a control table that the driver needs."""
 
   name: str
   model_number: int

@@ -7,8 +7,8 @@ rest. Between motions, ``get_observation`` feeds the watchdog, so that the progr
 on. If nobody reads the arm, it ends, and ``start`` sends it again.
 
 The wrench is ``actual_TCP_force`` of RTDE, which an e-Series controller gives at the
-tool flange, in the axes of the base, without the payload. Its sign, of which no
-document was found, is taken as that of the surroundings' push on the tool.
+tool flange, in the axes of the base, without the payload. Its sign, which no known
+document states, is taken as that of the surroundings' push on the tool.
 
 The ports are those of every controller (dashboard 29999, script 30003, RTDE 30004);
 ``ur_rtde`` cannot change them.
@@ -60,9 +60,9 @@ class UR5e:
     Args:
       host: Address of the controller.
       payload_kg: Mass of everything on the tool flange.
-      payload_cog_m: Its center of gravity in the axes of the flange.
-      lookahead_s: Of servoJ, 0.03 to 0.2.
-      gain: Of servoJ, 100 to 2000.
+      payload_cog_m: Center of gravity of the payload in the axes of the flange.
+      lookahead_s: Look-ahead time of servoJ, 0.03 to 0.2.
+      gain: Gain of servoJ, 100 to 2000.
     """
     self._host = host
     self._payload = float(payload_kg), [float(x) for x in payload_cog_m]
@@ -200,7 +200,7 @@ class UR5e:
     return self._open().fault(following=self._following)
 
   def _feed(self) -> None:
-    """Feeds the watchdog, as each command does; this one is to do nothing."""
+    """Feeds the watchdog, as each command does, with the command to do nothing."""
     now = time.monotonic()
     if now - self._fed > _FEED:
       self._fed = now

@@ -1,4 +1,4 @@
-"""Whether a UR5e answers at an address, before ``ur_rtde`` connects to it.
+"""Checks that a UR5e answers at an address, before ``ur_rtde`` connects to it.
 
 The clients of ``ur_rtde`` wait forever for a server that accepts a connection but does
 not speak RTDE.

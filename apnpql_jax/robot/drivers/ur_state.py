@@ -1,4 +1,4 @@
-"""What a UR controller reports by RTDE: measurements, faults and the time of both."""
+"""Reports of a UR controller by RTDE: measurements, faults and the time of both."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Reports:
     """Returns why the arm does not follow commands.
 
     Args:
-      following: Whether it should follow now, so that no program is a fault, too.
+      following: Whether it should follow now: then a stopped program is a fault, too.
     """
     source = self._source
     silence = self._clock.silence(source.getTimestamp())

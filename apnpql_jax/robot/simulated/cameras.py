@@ -100,7 +100,7 @@ def state_of(task: Any, found: Any) -> PhysicsState:
 
 
 class SimulatedCamera:
-  """See ``protocols.Camera``; the first camera draws for both."""
+  """A simulated ``protocols.Camera``; the first one draws for both."""
 
   def __init__(self, view: View, index: int):
     """Keeps the view; ``index`` is that of ``CAMERAS``."""

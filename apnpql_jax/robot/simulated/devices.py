@@ -48,7 +48,7 @@ class _OnBoard:
 
 
 class SimulatedArm(_OnBoard):
-  """See ``protocols.Arm``."""
+  """A simulated ``protocols.Arm``."""
 
   _zeroed = 0
 
@@ -88,7 +88,7 @@ class SimulatedArm(_OnBoard):
 
 
 class SimulatedGripper(_OnBoard):
-  """See ``protocols.Gripper``."""
+  """A simulated ``protocols.Gripper``."""
 
   def describe(self) -> dict[str, Any]:
     """See ``Device.describe``."""
@@ -162,7 +162,7 @@ def opened(robot: Robot) -> Generator[Blackboard]:
 
 
 class Operator:
-  """What an operator does at a real arm, done to a started plant."""
+  """The help that an operator gives a real arm, for a started plant."""
 
   def __init__(
     self, board: Blackboard, wait: Callable[[Callable[[], bool], str], None]

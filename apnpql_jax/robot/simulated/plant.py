@@ -22,7 +22,7 @@ from apnpql_jax.sim.names import ARM_JOINTS, BASE_SITE, FLANGE_SITE, GRIPPER_JOI
 
 @dataclasses.dataclass(frozen=True)
 class Servo:
-  """How the simulated arm follows commands; guesses, not those of a real UR5e."""
+  """Servo parameters of the simulated arm: guesses, not those of a real UR5e."""
 
   lookahead_s: float = 0.03
   """Time constant with which the target is approached, s."""
@@ -64,7 +64,7 @@ class Plant:
     self._settle()
 
   def zero_force(self) -> None:
-    """Zeroes the sensor: what it feels now, it takes for nothing."""
+    """Zeroes the sensor, which then reads the present wrench as none."""
     self.sensor.zero(self.wrench())
 
   def place(

@@ -46,7 +46,7 @@ TURNS = {"wrist": (0.01, -0.008, 0.012), "global": (-0.012, 0.01, 0.006)}
 
 @pytest.fixture(scope="module")
 def contract() -> dict[str, Any]:
-  """The contract of a policy that was trained with randomization."""
+  """Returns the contract of a policy that was trained with randomization."""
   scene = load_scene(project_files.mjcf_path("push_plate"))
   config = EnvConfig(task="push_plate", randomize=True)
   images = {
@@ -75,7 +75,7 @@ def photograph(made: Studio, folder: Path, name: str, **options: Any) -> Case:
 
 @pytest.fixture(scope="module")
 def wrist(tmp_path_factory) -> Case:
-  """Twelve views of a board on the table, by a distorting lens."""
+  """Returns twelve views of a board on the table, by a distorting lens."""
   with studio(BOARD, on_tool=False) as made:
     return photograph(
       made, tmp_path_factory.mktemp("wrist"), "wrist", distortion=DISTORTION
@@ -84,14 +84,14 @@ def wrist(tmp_path_factory) -> Case:
 
 @pytest.fixture(scope="module")
 def held(tmp_path_factory) -> Case:
-  """Twelve views of a board in the hand by the global camera."""
+  """Returns twelve views of a board in the hand by the global camera."""
   with studio(BOARD, on_tool=True) as made:
     return photograph(made, tmp_path_factory.mktemp("held"), "global")
 
 
 @pytest.fixture
 def both(tmp_path, wrist, held) -> Path:
-  """A folder with the views of both cameras."""
+  """Returns a folder with the views of both cameras."""
   shutil.copytree(wrist.folder, tmp_path / "views" / "wrist")
   shutil.copytree(held.folder, tmp_path / "views" / "global")
   return tmp_path / "views"
@@ -384,7 +384,7 @@ def test_bad_views_are_one_line(contract, both, tmp_path):
 
 @pytest.fixture
 def written(contract, tmp_path) -> Path:
-  """A calibration of cameras that are where the contract says."""
+  """Returns a calibration of cameras that are where the contract says."""
   lens = views.Lens(720, 1280, 900.0, 900.0, 639.5, 359.5)
   cameras = {}
   for name in contract["cameras"]:

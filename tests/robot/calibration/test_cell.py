@@ -21,7 +21,7 @@ from apnpql_jax.robot.drivers.ur_listener import Listener
 
 @pytest.fixture(scope="module")
 def host():
-  """Address of a controller whose arm stands still, and that nobody commands."""
+  """Yields the address of a controller whose arm stands still, without commands."""
   with contextlib.closing(doubles.serve("push_plate", noise=False)) as server:
     yield server.greeting[0]
 

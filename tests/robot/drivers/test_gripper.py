@@ -52,7 +52,7 @@ ANSWER_S = 0.022
 
 @contextlib.contextmanager
 def bench(**settings) -> Generator[tuple[str, str]]:
-  """Address of the doubles, and the gripper's serial port."""
+  """Yields the address of the doubles, and the gripper's serial port."""
   server = doubles.serve("push_plate", **settings)
   yield server.greeting
   server.close()
@@ -66,7 +66,7 @@ def connect(port: str) -> driver.RHP12RN:
 
 @contextlib.contextmanager
 def held(port: str) -> Generator[driver.RHP12RN]:
-  """The connected gripper."""
+  """Yields the connected gripper."""
   gripper = connect(port)
   yield gripper
   gripper.disconnect()
@@ -332,7 +332,7 @@ def test_another_dynamixel_is_one_line():
 
 @contextlib.contextmanager
 def terminal(answer: Callable[[bytes], bytes]) -> Generator[tuple[str, int]]:
-  """A serial port behind which ``answer`` answers, and its descriptor."""
+  """Yields a serial port behind which ``answer`` answers, and its descriptor."""
   ours, theirs = os.openpty()
   tty.setraw(theirs)
 

@@ -33,7 +33,7 @@ def picture(seed: int) -> np.ndarray:
 
 @contextlib.contextmanager
 def connected(**settings: Any) -> Generator[tuple[SoftwareCamera, RealSense]]:
-  """A camera that has delivered picture(0)."""
+  """Yields a camera that has delivered picture(0)."""
   double = SoftwareCamera(rs, "wrist")
   camera = RealSense(
     double.serial, view=VIEW, size=SIZE, devices=[double.device], **settings

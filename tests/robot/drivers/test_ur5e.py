@@ -28,7 +28,7 @@ pytest.importorskip("rtde_control", reason="needs ur_rtde")
 
 @pytest.fixture
 def rig() -> Generator[doubles.Doubles]:
-  """The arm of push_plate, started."""
+  """Yields the arm of push_plate, started."""
   with doubles.start("push_plate", noise=False) as devices:
     devices.arm.start()
     yield devices
