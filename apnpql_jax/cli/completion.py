@@ -15,7 +15,7 @@ import tyro
 from apnpql_jax.cli.options import Command
 from apnpql_jax.errors import check_name
 
-SHELLS = ("bash", "zsh", "tcsh")
+SHELLS = ("bash", "zsh")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Completion(Command):
   uses_jax: ClassVar[bool] = False
 
   shell: tyro.conf.Positional[str] = ""
-  """Shell: bash, zsh or tcsh."""
+  """Shell: bash or zsh."""
 
 
 def completion(args: Completion, commands: Mapping[str, type[Any]]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import pytest
 from terminals import read_all, terminal
 
 from apnpql_jax.cli import commands, main, text
+from apnpql_jax.cli.completion import SHELLS
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = sorted(commands.COMMANDS)
@@ -108,9 +109,16 @@ def test_bash_completes_commands_and_options(words, expected, tmp_path, capsys):
   assert sorted(done.stdout.split()) == expected, done.stderr
 
 
+@pytest.mark.parametrize("shell", SHELLS)
+def test_each_shell_has_a_script_with_all_commands(shell, capsys):
+  assert main.main(["completion", shell]) == 0
+  shown = capsys.readouterr().out
+  assert all(command in shown for command in COMMANDS)
+
+
 def test_a_shell_without_a_script_is_named(capsys):
   assert main.main(["completion", "fish"]) == 2
-  assert "choose from bash, zsh, tcsh" in capsys.readouterr().err
+  assert "choose from bash, zsh" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("args", ["train push_plate --help", "sweep --help"])
