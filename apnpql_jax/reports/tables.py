@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from apnpql_jax.reports import groups as grouping, statistics
-from apnpql_jax.reports.groups import Group
+from apnpql_jax.reports import statistics
+from apnpql_jax.reports.groups import Group, differing, settings, tasks_of, text
 from apnpql_jax.reports.reading import Run
 
 GOAL = 0.8
@@ -20,8 +20,8 @@ def compare(groups: Sequence[Group]) -> str:
   """Returns all tables with headings, and the commits of the runs."""
   parts = ["## Settings", markdown(of_groups(groups))]
   parts += ["## Runs", markdown(of_runs(groups))]
-  if len(differing := of_settings(groups)) > 1:
-    parts += ["## What differs", markdown(differing)]
+  if len(rows := of_settings(groups)) > 1:
+    parts += ["## What differs", markdown(rows)]
   notes = [f"Success is the mean over runs and its {statistics.BANDS['interval']}."]
   if found := commits(run for group in groups for run in group.runs):
     notes.append(f"Made at commit {', '.join(found)}.")
@@ -81,11 +81,11 @@ def of_runs(groups: Sequence[Group]) -> Rows:
 
 def of_settings(groups: Sequence[Group], *, whole: bool = False) -> Rows:
   """Returns a row per setting that differs, or per setting, and a column per group."""
-  values = [grouping.settings(group.runs[0].config) for group in groups]
-  names = list(values[0]) if whole else grouping.differing(values)
+  values = [settings(group.runs[0].config) for group in groups]
+  names = list(values[0]) if whole else differing(values)
   titles = [column(group, groups) for group in groups]
   rows = [["setting", *titles]]
-  return rows + [[name, *(grouping.text(x[name]) for x in values)] for name in names]
+  return rows + [[name, *(text(x[name]) for x in values)] for name in names]
 
 
 def records(groups: Sequence[Group]) -> list[dict[str, Any]]:
@@ -114,7 +114,7 @@ def records(groups: Sequence[Group]) -> list[dict[str, Any]]:
 
 def column(group: Group, groups: Sequence[Group]) -> str:
   """Returns the title of a group among others, whose tasks may differ."""
-  if len(grouping.tasks_of(groups)) == 1 or not group.label:
+  if len(tasks_of(groups)) == 1 or not group.label:
     return group.title
   return f"{group.task}: {group.label}"
 
